@@ -27,7 +27,7 @@ from inputs import grid, rig
 import lfpiv
 from lfpiv.reconstruction.first_guess import multiplicative_guess
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Partition, iterate_epochs, subsets_of
+from lfpiv.reconstruction.ordered_subsets import CONFLICT, WHOLE_PASSES, Partition, iterate_epochs, subsets_of
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, State
@@ -121,9 +121,9 @@ class Passes:
         """Return the traffic of an epoch over two subsets of each camera, which larger ones may follow."""
 
         def run() -> None:
-            subsets, light = subsets_of(self._cameras, True), ones(self._size)
+            subsets, light = subsets_of(self._cameras, 2), ones(self._size)
             state, sieve = State(light, None, ()), Sieve(SIEVE_VOXEL, self._shape)
-            partition = Partition(subsets, (SharpenedStep(light, sieve),) * len(subsets))
+            partition = Partition(subsets, (SharpenedStep(light, sieve),) * len(subsets), conflict=CONFLICT)
             for _ in iterate_epochs(self._equations(), state, sieve, partitions=(partition, partition), epochs=1):
                 pass
 

@@ -69,19 +69,25 @@ class PreparedInstant:
         state = State(guess, momentum, normalisation.steps)
         count = settings.iterations if iterations is None else iterations
         history = History(settings, count)
-        epochs = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
-        partitions = normalisation.partitions if epochs else ()
+        possible = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
+        partitions = normalisation.partitions if possible else ()
+        epochs = partitions[0].most_epochs(possible) if partitions else 0
+        rose = False
         with self.equations.locked():
             if partitions:
-                state = self._solve_subsets(state, partitions, history, epochs, brief, first is None, progress)
-            if brief and history.epochs == count:
+                state, rose = self._solve_subsets(state, partitions, history, epochs, brief, first is None, progress)
+            left = count - history.epochs
+            enough = bool(partitions) and partitions[0].is_joint and history.epochs < possible and not rose
+            if enough:
+                left = min(left, whole_passes)
+            if brief and left == 0:
                 volume, stop = normalisation.sieve(state.coefficients), None
                 history.append(Misfit(math.nan, math.nan))
             else:
-                volume, stop = self._solve_whole(state, history, progress)
+                volume, stop = self._solve_whole(state, history, left, progress)
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
-        last = SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
+        last = SmartStop.ENOUGH if enough else SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
         return Reconstruction(
             grid=self.stored.grid,
             volume=self._restored(volume),
@@ -148,8 +154,11 @@ class PreparedInstant:
         brief: bool,
         rest: bool,
         progress: Callable[[float], None] | None,
-    ) -> State:
-        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit."""
+    ) -> tuple[State, bool]:
+        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit.
+
+        Return the state, and whether the misfit of the last epoch rose.
+        """
         if not brief:  # exact, as all steps begin here
             history.append(self.equations.compare(self.normalisation.sieve(state.coefficients)))
         resting = RestingVoxels(self.equations) if rest or not brief else None
@@ -162,8 +171,9 @@ class PreparedInstant:
             resting=resting,
             left_out=DARK if resting is None and self.normalisation.sieve.sigma_voxel == 0 else 0.0,
         )
+        rose = False
         for epoch in epochs_of:
-            state = epoch.state
+            state, rose = epoch.state, epoch.rose
             if brief or history.epochs:
                 history.append(epoch.misfit)
             history.subsets.append(epoch.subsets)
@@ -173,17 +183,18 @@ class PreparedInstant:
                 break
         if resting is not None:
             resting.wake()
-        return state
+        return state, rose
 
     def _solve_whole(
         self,
         state: State,
         history: History,
+        left: int,
         progress: Callable[[float], None] | None,
     ) -> tuple[DeviceArray, SmartStop | None]:
-        """Iterate over all rays in the iterations that are left. Return the last volume, and why it stopped early."""
+        """Iterate over all rays `left` times. Return the last volume, and why it stopped early."""
         sieve, smooth = self.normalisation.sieve, self.normalisation.smoothing
-        left, done = history.iterations - history.epochs, history.epochs
+        done = history.epochs
         states = iterate(self.equations, state, sieve, iterations=left, smooth=smooth)
         for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
             history.append(misfit)

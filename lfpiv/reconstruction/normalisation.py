@@ -11,7 +11,15 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv.reconstruction.ordered_subsets import CONFLICT, JOINT_CONFLICT, Partition, Subset, step_sizes, subsets_of
+from lfpiv.reconstruction.ordered_subsets import (
+    CONFLICT,
+    JOINT_CONFLICT,
+    POINT_CONFLICT,
+    Partition,
+    Subset,
+    step_sizes,
+    subsets_of,
+)
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve, Smoothing
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
@@ -19,6 +27,8 @@ from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
+COMPARED = 4
+"""Each so-manieth subset of all cameras is one by which guesses are compared."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 
@@ -70,8 +80,16 @@ class Normalisation:
 
     @property
     def sample(self) -> tuple[Subset, ...]:
-        """Subsets by which guesses are compared: of each camera one. None without subsets."""
+        """Subsets by which guesses are compared: of each camera one, or some of all cameras. None without subsets."""
+        if self._is_joint:
+            return self._subsets[: -(-len(self._subsets) // COMPARED)]
         return tuple(subset for subset in self._subsets if subset.parts[0][1] != 1) if self.has_subsets else ()
+
+    @property
+    def _is_joint(self) -> bool:
+        """Whether each subset has rays of all cameras."""
+        cameras = [camera for camera, _ in self._subsets[0].parts] if self.has_subsets else []
+        return self._weights.has_ray_rows and len(set(cameras)) == len(self._weights.cameras)
 
     @cached_property
     def gains(self) -> dict[str, DeviceArray]:
@@ -115,13 +133,26 @@ class Normalisation:
     @cached_property
     def partitions(self) -> tuple[Partition, ...]:
         """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
+        if self._is_joint:
+            return (self._joint_partition(),)
         cameras = len(self._weights.cameras)
-        joint = len(self._subsets[0].parts) > 1 or len(self._subsets) > 2 * cameras
-        if joint:
-            return (self._partition(self._subsets, JOINT_CONFLICT),)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
         in_turn = (self._subsets, subsets_of(cameras)) if may_grow else (self._subsets,)
         return tuple(self._partition(subsets, CONFLICT if may_grow else 0.0) for subsets in in_turn)
+
+    def _joint_partition(self) -> Partition:
+        """Return the subsets of all cameras. All have the same step, of another length each."""
+        count, light = len(self._subsets), np.zeros(len(self._subsets))
+        for number, name in enumerate(self._weights.cameras):
+            of_sets = self._camera_gains[number] * self._weights.light_of_sets(name)
+            light += [of_sets[ray_set] for subset in self._subsets for camera, ray_set in subset.parts if camera == number]
+        lengths = tuple((count / np.maximum(count * light / light.sum(), 1)).tolist())
+        size = self._quotient(np.float32(self._settings.relaxation), self._column_sum, self._seen)
+        plain = (SmartStep(size, self.sieve),) * count
+        if self.sieve.sigma_voxel == 0:
+            return Partition(self._subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
+        sharpened = (SharpenedStep(size, self.sieve),) * count
+        return Partition(self._subsets, sharpened, plain, lengths, JOINT_CONFLICT)
 
     def _partition(self, subsets: tuple[Subset, ...], conflict: float) -> Partition:
         """Return the subsets with the step of each."""
@@ -132,7 +163,7 @@ class Normalisation:
         if self.sieve.sigma_voxel == 0:
             return Partition(subsets, plain, conflict=conflict)
         sharpened = tuple(SharpenedStep(size, self.sieve) for size in on_device)
-        return Partition(subsets, sharpened, plain, conflict)
+        return Partition(subsets, sharpened, plain, conflict=conflict)
 
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""

@@ -1,9 +1,12 @@
 """Ordered subsets: SMART steps from a part of the rays each, so that one pass over all rays makes several steps.
 
-A subset is the rays of one camera through every other lens. Its pixels are those that see no other lens; a pixel
-between two lenses takes part in whole passes only. The exponent of subset n is sum_{i in n} w log((I + b) / (P + b)).
-Its step is that of `lfpiv.reconstruction.steps` with max(s_n, s / N) in place of s, where s_n are the weights' sums
-over the subset and N is the number of subsets. Momentum goes on from subset to subset [1]_.
+A subset is some rows of pixels under every lens, of all cameras at once. Such rows see a part of the pupil each, and all
+of the volume. Where weights are stored in blocks a subset is the rays of one camera through every other lens. Its pixels
+are those that see no other set of rays; a pixel between two of them takes part in whole passes only. The exponent of
+subset n is sum_{i in n} w log((I + b) / (P + b)). Its step is that of `lfpiv.reconstruction.steps` with max(s_n, s / N)
+in place of s, where s_n are the weights' sums over the subset and N is the number of subsets. For rows of pixels s_n is
+nearly the same part of s in all voxels, and that part of the volume's light stands for it. Momentum goes on from subset
+to subset [1]_.
 
 Different subsets ask for slightly different volumes, so their steps end in a cycle around the solution. Steps become
 shorter from epoch to epoch, and the last passes take all rays: there the misfit falls in every pass [2]_.
@@ -12,8 +15,12 @@ What the volume cannot explain widens that cycle: particles that are not equally
 particle, particles smaller than voxels. Each subset then undoes what the others did, and the volume keeps the errors of
 single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b> = sum_j c_j a_j b_j, the agreement
 |sum_n g_n|^2 / sum_n |g_n|^2 is N where all of N subsets ask for the same, 1 where their exponents are independent, and
-0 where they cancel. Below `CONFLICT` the following epochs take larger subsets. Stochastic gradient methods enlarge
-their samples by such a test of norms [3]_.
+0 where they cancel. Below a limit larger subsets follow, or the passes over all rays. Stochastic gradient methods
+enlarge their samples by such a test of norms [3]_. Rows of all cameras bring particles out of the noise until they all
+but cancel (`JOINT_CONFLICT`). Volumes of points, without a sieve, follow the noise sooner (`POINT_CONFLICT`).
+
+How far the solution is depends on the number of steps, whatever share of the rays each of them takes. So epochs of many
+subsets end after `MOST_STEPS` steps.
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
 rises, the epoch is undone, the momentum starts anew, and SMART's own steps follow (here divided by sums that are not
@@ -56,9 +63,12 @@ WHOLE_PASSES = 2
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
 CONFLICT = 0.5
-JOINT_CONFLICT = 0.1
-"""The same for subsets of all cameras, after which the passes over all rays follow."""
-"""Agreement of subsets below which the next epochs take larger ones: half that of independent exponents."""
+"""Agreement of subsets of one camera each below which the next epochs take larger ones: half that of independent
+exponents."""
+JOINT_CONFLICT, POINT_CONFLICT = 0.1, 0.5
+"""Agreement of subsets of all cameras below which the passes over all rays follow, with a sieve and without."""
+MOST_STEPS = 128
+"""Steps by subsets after which no other epoch of subsets of all cameras begins."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +89,19 @@ class Partition:
     """Step of each subset; all are of one kind."""
     safer: tuple[Step, ...] = ()
     """Step of each subset after the misfit of an epoch rose; empty for none."""
+    lengths: tuple[float, ...] = ()
+    """Factor of the exponent in each subset's step; empty for 1."""
     conflict: float = 0.0
     """Agreement of the subsets below which they are left."""
+
+    @property
+    def is_joint(self) -> bool:
+        """Whether each subset has rays of all cameras, and the passes over all rays follow."""
+        return bool(self.lengths)
+
+    def most_epochs(self, possible: int) -> int:
+        """Return the largest number of epochs, at most a possible one."""
+        return min(possible, -(-MOST_STEPS // len(self.subsets))) if self.is_joint else possible
 
 
 @dataclass(frozen=True)
@@ -92,6 +113,8 @@ class Epoch:
     """Sum of the subsets' misfits, each before its own step: no exact misfit of any volume."""
     subsets: int
     """Number of subsets of the epoch."""
+    rose: bool
+    """Whether the misfit rose."""
     undone: bool = False
     """Whether the misfit rose, the state is that before the epoch, and other epochs can follow."""
 
@@ -130,11 +153,15 @@ def subsets_of(cameras: int, sets: int = 1) -> tuple[Subset, ...]:
     return tuple(Subset(((camera, number),)) for camera in range(cameras) for number in numbers)
 
 
-def joint_subsets(cameras: int, sets: int) -> tuple[Subset, ...]:
-    """Return the subsets in their order: one set of the rays of all cameras each, far ones after each other."""
-    bits = max(sets - 1, 1).bit_length()
+def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
+    """Return a number of subsets in their order: each every so-manieth set of the rays of all cameras, far ones in turn."""
+    bits = max(count - 1, 1).bit_length()
     order = (int(f"{number:0{bits}b}"[::-1], 2) for number in range(1 << bits))
-    return tuple(Subset(tuple((camera, number) for camera in range(cameras))) for number in order if number < sets)
+    return tuple(
+        Subset(tuple((camera, ray_set) for camera in range(cameras) for ray_set in range(first, sets, count)))
+        for first in order
+        if first < count
+    )
 
 
 def step_sizes(column_sum: np.ndarray, subset_sums: Sequence[np.ndarray], lit: np.ndarray) -> list[np.ndarray]:
@@ -191,18 +218,19 @@ def iterate_epochs(
         if active is not None:
             momentum.forget(coefficients, active)
             over = steps[0].over(active)
-        length = float(np.float32(1 / (1 + SHORTENING * epoch)))
+        length = 1 / (1 + SHORTENING * epoch)
         start = duplicate(coefficients)
         agreement = Agreement(start) if partition.conflict > 0 else None
         equations.begin()
-        for subset, step in zip(partition.subsets, steps, strict=True):
+        lengths = partition.lengths or (1.0,) * len(steps)
+        for subset, step, of_subset in zip(partition.subsets, steps, lengths, strict=True):
             volume = sieve(coefficients)
             if active is not None:
                 volume = multiply(volume, active)
             exponent = equations.exponent_of(subset.parts, volume)
             if agreement is not None:
                 agreement.add(exponent)
-            coefficients, after = step(coefficients, exponent, momentum, length=length, over=over, in_place=True)
+            coefficients, after = step(coefficients, exponent, momentum, length=length * of_subset, over=over, in_place=True)
             assert after is not None  # with a momentum there is one after it
             momentum = after
         misfit, count = equations.measured(), len(partition.subsets)
@@ -211,7 +239,7 @@ def iterate_epochs(
             coefficients, momentum = start, Momentum(duplicate(start), largest=SUBSET_MOMENTUM)
         may_be_safer = bool(partition.safer) and not safely
         is_last = rose and not may_be_safer and not following
-        yield Epoch(State(coefficients, momentum, state.steps), misfit, count, undone=rose and not is_last)
+        yield Epoch(State(coefficients, momentum, state.steps), misfit, count, rose, undone=rose and not is_last)
         if is_last:
             log.debug("epoch %d: misfit rises, passes over all rays follow", epoch + 1)
             return

@@ -23,6 +23,7 @@ class SmartStop(enum.Enum):
 
     DONE = "all iterations asked for were done"
     CONVERGED = "misfit no longer falls by more than the tolerance"
+    ENOUGH = "more steps by subsets of the rays would not improve the volume"
     ITERATION_LIMIT = "iteration limit reached: raise smart.iterations if the misfit still falls"
     DIVERGED = "misfit rises: lower smart.relaxation"
 

@@ -120,9 +120,8 @@ class SmartSolver:
         """
         cameras, wanted = len(self.weights.cameras), self.settings.subsets
         projectors = [self.weights.projector(name) for name in self.weights.cameras]
-        fewest = min(projector.ray_sets for projector in projectors)
-        if fewest > 2 and self.settings.allows_subsets and wanted == AUTO:
-            return joint_subsets(cameras, fewest)
+        if self.weights.has_ray_rows:
+            return self._rows_in_subsets(cameras, min(projector.ray_sets for projector in projectors), wanted)
         halves = all(self._can_halve(name) for name in self.weights.cameras)
         possible = sorted({1, cameras, 2 * cameras if halves else 1})
         if isinstance(wanted, str):
@@ -132,6 +131,13 @@ class SmartSolver:
             numbers = ", ".join(map(str, possible))
             raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
         return subsets_of(cameras, 2 if wanted == 2 * cameras else 1) if wanted > 1 else subsets_of(1)
+
+    def _rows_in_subsets(self, cameras: int, sets: int, wanted: int | str) -> tuple[Subset, ...]:
+        """Return the subsets where weights can take some rows of pixels alone."""
+        count = wanted if not isinstance(wanted, str) else sets if self.settings.allows_subsets else 1
+        if count > sets:
+            raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {count}.")
+        return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)
 
     def _can_halve(self, name: str) -> bool:
         """Return whether most of a camera's pixels see only even or only odd lenses."""

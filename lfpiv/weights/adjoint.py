@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.geometry.grid import Grid
     from lfpiv.weights.stored_grid import StoredGrid
-    from lfpiv_kernels.reconstruction.projector import Projector
+    from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 
 
 class Forward(Protocol):
@@ -24,7 +24,7 @@ class Forward(Protocol):
     def grid(self) -> Grid:
         """The voxels."""
 
-    def projector(self, name: str) -> Projector:
+    def projector(self, name: str) -> RayProjector:
         """Return one camera's weights."""
 
     def __call__(self, volume: np.ndarray, out: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:

@@ -247,39 +247,3 @@ def blocks_of(
         even_values=even_values,
         microimages=packed.calibrated.microimages,
     )
-
-
-def largest_weight(blocks: Blocks) -> float:
-    """Return the largest weight of a ray. A pixel that a voxel reaches through two lenses has two rays."""
-    order = 2 if blocks.form == "profiles" else 1
-    share = blocks.microimages.share
-    bound = blocks.scale.astype(np.float64) * LEVELS**order * share.max(initial=0.0)
-    best = 0.0
-    firsts = np.arange(0, len(bound), CHUNK_VOXELS)
-    for first in firsts[np.argsort(-np.maximum.reduceat(bound, firsts))] if len(firsts) else ():
-        last = min(first + CHUNK_VOXELS, len(bound))
-        if bound[first:last].max() <= best:
-            break
-        bound[first:last] *= _levels(blocks, first, last) / LEVELS**order
-        for voxel in first + np.argsort(-bound[first:last]):
-            if bound[voxel] <= best:
-                break
-            ray, weight = blocks.entries(int(voxel))
-            best = max(best, float((weight * share[ray]).max(initial=0.0)))
-    return best
-
-
-def _levels(blocks: Blocks, first: int, last: int) -> np.ndarray:
-    """Return the largest level of each voxel from `first` to `last`. With profiles it is a product of two levels."""
-    some = slice(blocks.first_block[first], blocks.first_block[last])
-    width, height = (array[some].astype(np.int64) for array in (blocks.width, blocks.height))
-    largest = np.zeros(last - first)
-    if not len(width):
-        return largest
-    profiles = blocks.form == "profiles"
-    sizes = np.stack([width, height], axis=1).ravel() if profiles else width * height
-    level = blocks.value[blocks.first_value[first] : blocks.first_value[last]]
-    tops = np.maximum.reduceat(level, np.cumsum(sizes) - sizes).astype(float)
-    of_voxel = np.repeat(np.arange(last - first), np.diff(blocks.first_block[first : last + 1]))
-    np.maximum.at(largest, of_voxel, tops[::2] * tops[1::2] if profiles else tops)
-    return largest

@@ -11,8 +11,10 @@ from lfpiv.weights.choice import form_errors, warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
 from lfpiv.weights.operator import Weights
+from lfpiv.weights.separable import separable_bytes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
 from lfpiv_kernels.weights.ray_model import MODEL_SIZE
 
@@ -25,6 +27,10 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto", pa
 
     Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
     """
+    runtime.device()
+    stored = StoredGrid(grid, (0, 1, 2))
+    if form != "pixels" and (separable := separable_bytes(stored, calibration.cameras)) is not None:
+        return separable
     total = 0.0
     for camera, (_, size, blocks, values) in _samples(calibration, grid, form, particle_voxel):
         rays = rays_bytes(camera)
@@ -56,8 +62,8 @@ def _samples(
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare weights with counted rays in a few random voxels of every camera.
 
-    Weights of nodes stand for those of particles, so there the voxels' own footprints are compared; `choose_planes`
-    compared the nodes. Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+    Weights of nodes and profiles of planes stand for those of particles, so there the voxels' own footprints are
+    compared; `choose_planes` and `choose_separable` compared the others. Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
 
     Returns
     -------
@@ -74,6 +80,6 @@ def compare_with_count(weights: Weights) -> dict[str, list[float]]:
 def _count_errors(weights: Weights, name: str) -> list[float]:
     """Return the relative L2 differences of one camera's counted voxels."""
     counted, projector = weights.counted(name), weights.projector(name)
-    if projector.planes is None:
+    if isinstance(projector, Projector) and projector.planes is None:
         return counted.errors(projector)
     return form_errors(counted, weights.forms[name], weights.cuts[name])

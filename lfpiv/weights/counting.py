@@ -17,7 +17,8 @@ from lfpiv.weights.ray_fit import fit_rays
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays.count import count_rays
-from lfpiv_kernels.reconstruction.projector import Blocks, Projector
+from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -103,7 +104,7 @@ def count_voxels(
     return count, total, first_pixel
 
 
-def add_entries(image: np.ndarray, stored: Blocks | Projector, voxel: int) -> None:
+def add_entries(image: np.ndarray, stored: Blocks | RayProjector, voxel: int) -> None:
     """Add one voxel's stored weights to a sensor image, in place."""
     ray, weight = stored.entries(voxel)
     share = stored.microimages.share[ray]
@@ -142,7 +143,7 @@ class CountedVoxels:
         for half, start in zip(self._halves, self._corner, strict=True):
             half *= _window(camera.gain, start, half.shape[1:])
 
-    def errors(self, stored: Blocks | Projector, voxels: Sequence[int] | None = None) -> list[float]:
+    def errors(self, stored: Blocks | RayProjector, voxels: Sequence[int] | None = None) -> list[float]:
         """Return the relative L2 difference of weights from the counts, one per voxel, the counts' noise subtracted.
 
         `voxels` are the indices of the counted voxels in `stored`; default: their stored indices in the grid.

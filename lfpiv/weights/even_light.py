@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 
 log = logging.getLogger(__name__)
 
@@ -34,13 +34,13 @@ class EvenLight:
 
 
 def project_even_light(
-    projectors: Mapping[str, Projector], gains: Mapping[str, np.ndarray], camera_sums: np.ndarray
+    projectors: Mapping[str, RayProjector], gains: Mapping[str, np.ndarray], camera_sums: np.ndarray
 ) -> dict[str, EvenLight]:
     """Project an evenly lit volume onto all cameras.
 
     Parameters
     ----------
-    projectors : mapping of str to Projector
+    projectors : mapping of str to RayProjector
         Weights of each camera.
     gains : mapping of str to ndarray, shape (pixel,), float32
         White-image gain of each camera.

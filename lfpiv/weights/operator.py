@@ -24,11 +24,7 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.prompt import Card, Shown
 from lfpiv.settings.processing import Compute
 from lfpiv.weights.adjoint import Adjoint, checked_out
-from lfpiv.weights.blocks import (
-    Cuts,
-    footprint_blocks,
-    largest_weight,
-)
+from lfpiv.weights.blocks import Cuts, footprint_blocks
 from lfpiv.weights.card import card_of
 from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check
 from lfpiv.weights.counted_grid import count_blocks
@@ -36,9 +32,10 @@ from lfpiv.weights.counting import CountedVoxels, add_entries
 from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.even_light import EvenLight, project_even_light
+from lfpiv.weights.separable import choose_separable
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.weights import footprint
 
 if TYPE_CHECKING:
@@ -66,7 +63,7 @@ class Weights(Shown):
         Grid and the order of its voxels in memory.
     cameras : mapping of str to CalibratedCamera
         The cameras.
-    projectors : mapping of str to Projector
+    projectors : mapping of str to RayProjector
         Weights of each camera.
     method : {"footprint", "count"}
         How the weights were made.
@@ -82,7 +79,7 @@ class Weights(Shown):
         self,
         stored: StoredGrid,
         cameras: Mapping[str, CalibratedCamera],
-        projectors: Mapping[str, Projector],
+        projectors: Mapping[str, RayProjector],
         method: str,
         *,
         choices: Mapping[str, Choice] | None = None,
@@ -97,6 +94,7 @@ class Weights(Shown):
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
         self._set_sums: dict[tuple[str, int], np.ndarray] = {}
+        self._set_light: dict[str, np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
         self.derived: dict[tuple[Hashable, ...], Any] = {}
@@ -174,9 +172,14 @@ class Weights(Shown):
         weights: np.ndarray = image * setup.gain
         return weights
 
-    def projector(self, name: str) -> Projector:
+    def projector(self, name: str) -> RayProjector:
         """Return one camera's stored weights, without white-image gain."""
         return self._projectors[name]
+
+    @property
+    def has_ray_rows(self) -> bool:
+        """Whether all cameras can take rows of pixels under each lens alone."""
+        return all(projector.takes_rows for projector in self._projectors.values())
 
     @property
     def grid(self) -> Grid:
@@ -240,6 +243,20 @@ class Weights(Shown):
             self._set_sums[name, ray_set] = sums
         return self._set_sums[name, ray_set]
 
+    def light_of_sets(self, name: str) -> np.ndarray:
+        """Return the light of an evenly lit volume in the pixels of a camera that see one set of rays only.
+
+        Returns
+        -------
+        ndarray, shape (set,), float64
+        """
+        if name not in self._set_light:
+            projector, gain = self.projector(name), self.gain(name)
+            image = projector.project(np.ones(self.grid.size, np.float32), np.zeros_like(gain))
+            pixels = [projector.see_only(number) for number in range(projector.ray_sets)]
+            self._set_light[name] = np.array([(gain[own] * image[own]).sum(dtype=np.float64) for own in pixels])
+        return self._set_light[name]
+
     @property
     def column_sum(self) -> np.ndarray:
         """Sum of each voxel's weights over all pixels of all cameras, shape (z, y, x), float32."""
@@ -293,7 +310,7 @@ class Weights(Shown):
 
         A pixel that a voxel reaches through two lenses counts as two pixels.
         """
-        return max(largest_weight(self.projector(name).blocks) for name in self.cameras)
+        return max(self.projector(name).largest_weight() for name in self.cameras)
 
     @property
     def memory_bytes(self) -> int:
@@ -332,11 +349,13 @@ def build_weights(
         Area-integrated weights, or counted rays.
     form : {"auto", "profiles", "pixels"}
         How footprints are stored. "profiles": products of a profile along the sensor's columns and one along its rows
-        for every voxel and lens (rank 1), small and fast, for straight rays and square microlenses. "pixels": one value
-        per pixel, for any optics. "auto": profiles for each camera where they agree with counted rays.
+        (rank 1), for every voxel and lens or shared by planes of voxels, small and fast, for straight rays and square
+        microlenses. "pixels": one value per pixel, for any optics. "auto": profiles for each camera where they agree
+        with counted rays.
     planes : bool
-        Store the weights of nodes on planes across each camera's line of sight where that is accurate, see
-        `lfpiv.weights.depth_planes`. False: the weights of every voxel.
+        Store profiles that planes of voxels share where that is accurate, see `lfpiv.weights.separable`, or the weights
+        of nodes on planes across each camera's line of sight, see `lfpiv.weights.depth_planes`. False: the weights of
+        every voxel.
     particle_voxel : float
         Standard deviation of the particles [voxel], 0 if unknown. Below 0.85 only cameras near 0, 45 and 90 degrees to
         the grid's axes have planes.
@@ -375,30 +394,27 @@ def build_weights(
     stored = StoredGrid.for_cameras(grid, cameras.values())
     runtime.device()
     share = DeviceShare(cameras.values(), grid)
-    projectors, choices, counted = dict[str, Projector](), dict[str, Choice](), dict[str, CountedVoxels]()
+    projectors, choices, counted = dict[str, RayProjector](), dict[str, Choice](), dict[str, CountedVoxels]()
     whole = progress or (lambda fraction: None)
+    for name, camera in cameras.items() if method == "footprint" else ():
+        if form == "auto" and camera.lattice.layout == "square":
+            counted[name] = CountedVoxels(stored, camera)
+            choices[name] = choose_form(counted[name])
+        else:
+            choices[name] = choose_uncounted(stored, camera, form)
+    if planes and choices and all(choice.form == "profiles" for choice in choices.values()):
+        projectors.update(choose_separable(stored, cameras, limit_bytes, whole) or {})
     for number, (name, camera) in enumerate(cameras.items()):
+        if name in projectors:
+            continue
         used = sum(projector.nbytes for projector in projectors.values())
         step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         if method == "count":
             allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
             projectors[name] = share.projector(name, count_blocks(stored, camera, rays, step, allow, finished))
             continue
-        if form == "auto" and camera.lattice.layout == "square":
-            counted[name] = CountedVoxels(stored, camera)
-            choices[name] = choose_form(counted[name])
-        else:
-            choices[name] = choose_uncounted(stored, camera, form)
         chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
-        import os
-        if chosen.form == "profiles" and os.environ.get("SEP"):
-            from lfpiv.weights.separable import separable_weights
-            from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
-            w = separable_weights(stored, camera, step, allow)
-            radius = camera.optics.pupil_radius_mm * camera.optics.sensor_per_pupil / camera.optics.pixel_mm
-            projectors[name] = SeparableProjector(w, min(16, int(2 * radius)))
-            continue
         nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)

@@ -1,11 +1,17 @@
 """Weights of one camera as profiles that planes of voxels share: the lenses, the planes and the ray models they need.
 
-The output is `SeparableWeights`, see there and `lfpiv_kernels.weights.separable`.
+The output is `SeparableWeights`, see there and `lfpiv_kernels.weights.separable`. Profiles are shared exactly where the
+rows of the array lie along those of the sensor and along an axis of the volume, and nearly so where the array is turned
+a little. `choose_separable` compares images of particles with those from the voxels' own footprints.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,13 +20,133 @@ from threadpoolctl import threadpool_limits
 from lfpiv.lightfield.microimage_layout import microimage_centres
 from lfpiv.progress import StepProgress
 from lfpiv.weights.blocks import PackedCamera
+from lfpiv.weights.counting import draw_seen
+from lfpiv.weights.depth_planes import (
+    PARTICLE_ERROR,
+    PARTICLES,
+    SEEDS,
+    WORST_PARTICLE_ERROR,
+    Sample,
+    blobs_about,
+)
 from lfpiv.weights.ray_fit import grid_models
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction.projector_separable import MOST_VALUES, SeparableProjector, lines_bytes
 from lfpiv_kernels.reconstruction.separable_weights import PARTS, STRIP, SeparableWeights
-from lfpiv_kernels.weights.separable import Profiles
+from lfpiv_kernels.weights.separable import MOST_TAPS, PlaneProfiles, Profiles
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
+
+log = logging.getLogger(__name__)
+
+MOST_SETS = 16
+"""Sets of rows of pixels at most, each of which takes a step of a subset."""
+FEWEST_SETS = 4
+"""Rows of pixels across a microimage from which on they are taken in sets."""
+FEWEST_VOXELS = 20_000
+"""Voxels of a volume from which on planes share profiles."""
+SAMPLED_PLANES = 5
+"""Planes from which the memory of all planes is estimated."""
+RAY_BYTES = 1 + 8 + 8 + 2 * 8
+"""Memory of a ray [byte]: its rim, pixel and share; its light there and back; its place in the map to pixels, and that
+of the sets."""
+
+
+def ray_sets(cameras: Mapping[str, CalibratedCamera]) -> int:
+    """Return into how many sets the rows of pixels under a lens are divided: as many as the smallest microimage has."""
+    return min(MOST_SETS, *(int(2 * _radius_px(camera)) for camera in cameras.values()))
+
+
+def _radius_px(camera: CalibratedCamera) -> float:
+    """Return the radius of a camera's microimages [pixel]."""
+    optics = camera.optics
+    return float(optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm)
+
+
+def choose_separable(
+    stored: StoredGrid,
+    cameras: Mapping[str, CalibratedCamera],
+    limit_bytes: float,
+    progress: StepProgress,
+) -> dict[str, SeparableProjector] | None:
+    """Make the projectors of all cameras, if profiles of planes suit each of them.
+
+    Parameters
+    ----------
+    stored : StoredGrid
+        The voxels.
+    cameras : mapping of str to CalibratedCamera
+        The cameras, whose weights can be products of profiles.
+    limit_bytes : float
+        Memory that the weights may take [byte].
+    progress : callable
+        Called with the finished fraction.
+
+    Returns
+    -------
+    dict of str to SeparableProjector, or None
+        None if the weights of all voxels, or of nodes, are to be stored.
+    """
+    used = 0
+    if not are_possible(stored, cameras):
+        return None
+    projectors = {}
+    for number, (name, camera) in enumerate(cameras.items()):
+        planes = Planes(stored, camera)
+        if not planes.possible:
+            log.debug("%s: a pixel sees too many voxels side by side for profiles of planes", name)
+            return None
+        used += planes.estimated_bytes
+        if used > limit_bytes:
+            return None
+        weights = planes.weights(lambda part, number=number: progress((number + part) / len(cameras)))
+        if weights is None:
+            return None
+        projectors[name] = SeparableProjector(weights, ray_sets(cameras))
+        errors = particle_errors(stored, camera, projectors[name])
+        error = float(np.sqrt(np.mean(np.square(errors)))) if errors else math.inf
+        log.debug("%s: profiles of planes: images of particles differ by %.1f %%", name, 100 * error)
+        if not (error <= PARTICLE_ERROR and max(errors) <= WORST_PARTICLE_ERROR):
+            return None
+    return projectors
+
+
+def are_possible(stored: StoredGrid, cameras: Mapping[str, CalibratedCamera]) -> bool:
+    """Return whether profiles of planes may suit the cameras, by their lenses and the size of the volume."""
+    square = all(camera.lattice.layout == "square" for camera in cameras.values())
+    large = stored.size >= FEWEST_VOXELS
+    return square and large and ray_sets(cameras) >= FEWEST_SETS and runtime.device().form == "cpu"
+
+
+def separable_bytes(stored: StoredGrid, cameras: Mapping[str, CalibratedCamera]) -> int | None:
+    """Estimate the memory of profiles of planes and their rays [byte]; None where they do not suit the cameras.
+
+    Whether they are accurate is not looked at.
+    """
+    if not are_possible(stored, cameras):
+        return None
+    each = [Planes(stored, camera) for camera in cameras.values()]
+    return sum(one.estimated_bytes for one in each) if all(one.possible for one in each) else None
+
+
+def particle_errors(stored: StoredGrid, camera: CalibratedCamera, projector: SeparableProjector) -> list[float]:
+    """Compare images of particles with those from their voxels' own footprints: the relative L2 differences."""
+    seen = np.unique(np.concatenate([draw_seen(stored, camera, seed) for seed in SEEDS]))
+    if not len(seen):
+        return []
+    sample = Sample(camera, *blobs_about(stored, seen[:: len(seen) // PARTICLES + 1]), "profiles")
+    exact = [row.toarray().ravel() for part in sample.own_images(stored) for row in part]
+    errors = []
+    for voxels, light, own in zip(sample.voxels, sample.light, exact, strict=True):
+        volume = np.zeros(stored.size, np.float32)
+        np.add.at(volume, voxels, light.astype(np.float32))
+        image = projector.project(volume, np.zeros(len(own), np.float32))
+        norm = float(np.linalg.norm(own))
+        if norm > 0:
+            errors.append(float(np.linalg.norm(image - own)) / norm)
+    return errors
 
 
 def camera_axes(stored: StoredGrid, camera: CalibratedCamera) -> tuple[int, int, int]:
@@ -37,92 +163,166 @@ def camera_axes(stored: StoredGrid, camera: CalibratedCamera) -> tuple[int, int,
     return rows, 3 - rows - columns, columns
 
 
-def separable_weights(
-    stored: StoredGrid, camera: CalibratedCamera, progress: StepProgress, allow: Callable[[int], None]
-) -> SeparableWeights:
-    """Integrate the profiles of all voxels of a grid for one camera with square lenses."""
-    axes = camera_axes(stored, camera)
-    rows, planes, columns = (stored.shape[axis] for axis in axes)
-    optics, packed = camera.optics, PackedCamera.of(camera)
-    radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
-    first_lens, centre = microimage_centres(optics, camera.lattice, radius + 1)
-    lens_rows, lenses = centre.shape[:2]
-    strips = -(-lens_rows // STRIP)
-    beyond = lens_rows + np.arange(strips * STRIP - lens_rows)  # rows that fill the last strip
-    more = centre[-1] + (beyond - lens_rows + 1)[:, None, None] * (centre[-1] - centre[-2] if lens_rows > 1 else 0)
-    every = np.concatenate([centre, more])
-    first_row = np.floor(every[..., 1].min(1) - radius).astype(np.int32)
-    ray_rows = int((np.ceil(every[..., 1].max(1) + radius) - first_row).max())
-    in_strips = every[..., 0].reshape(strips, STRIP, lenses)
-    first_column = np.floor(in_strips.min(1) - radius).astype(np.int32)
-    pixels = int((np.ceil(in_strips.max(1) + radius) - first_column).max())
-    profiles = Profiles(
-        packed.camera,
-        packed.lattice,
-        packed.cell_mm,
-        frame=packed.frame,
-        first_lens=tuple(first_lens.tolist()),
-        lens_rows=lens_rows,
-        first_column=first_column,
-        first_row=first_row,
-        pixels=pixels,
-        ray_rows=ray_rows,
-    )
+@dataclass(frozen=True)
+class Planes:
+    """The planes of a volume as one camera sees them, and their profiles."""
 
-    def positions_mm(steps: np.ndarray) -> np.ndarray:
-        """Return places [mm] by indices (plane, row, column)."""
-        along = np.empty(np.shape(steps))
-        along[:, axes[1]], along[:, axes[0]], along[:, axes[2]] = steps.T
-        return stored.positions_mm(along)
+    stored: StoredGrid
+    camera: CalibratedCamera
 
-    world = tuple(2 - stored.order[axis] for axis in (axes[1], axes[0], axes[2]))
-    models = grid_models(camera, (planes, rows, columns), positions_mm, world)
-    part_rows = STRIP // PARTS
-    middle_rows = first_lens[1] + part_rows * np.arange(PARTS * strips) + (part_rows - 1) / 2
-    down, across, turns = [], [], np.empty((planes, strips, 2), np.float32)
-    with threadpool_limits(1, "blas"):
-        for plane, model in enumerate(models):
-            down.append(profiles.down(model, rows, columns))
-            seen, turn = _seen_by_parts(camera, model.reshape(rows, columns, -1), middle_rows)
-            turns[plane] = turn.reshape(strips, PARTS, 2).mean(1)
-            across.append(profiles.across(seen.reshape(len(middle_rows) * columns, -1), columns))
-            progress((plane + 1) / planes)
-    counts = np.array([[strip[:3] for strip in plane] for plane in across])
-    sizes = [[[strip[k].size for strip in plane] for plane in across] for k in (3, 4)]
-    first_start, level_start = (
-        np.concatenate([[0], np.cumsum(np.ravel(size))[:-1]]).reshape(planes, strips).astype(np.int64) for size in sizes
-    )
-    level_sizes = [one[1].size for one in down]
-    pixel, share, rim = profiles.rays()
-    centre_row = every[:, lenses // 2, 1] - first_row
-    lanes = centre_row.reshape(strips, PARTS, part_rows).swapaxes(1, 2)  # parts take turns
-    return SeparableWeights(
-        voxels=stored.shape,
-        axes=axes,
-        first_lens=tuple(first_lens.tolist()),
-        sensor_shape=optics.sensor_shape,
-        ray_rows=ray_rows,
-        first_column=first_column,
-        first_row=first_row,
-        pixels=pixels,
-        middle=np.ascontiguousarray(lanes, np.float32).ravel(),
-        down_first=np.stack([one[0] for one in down]),
-        down=np.concatenate([one[1] for one in down] + [np.zeros(16, np.uint8)]),
-        down_start=np.concatenate([[0], np.cumsum(level_sizes)[:-1]]).astype(np.int64),
-        down_taps=np.array([one[2] for one in down], np.int32),
-        down_scale=np.array([one[3] for one in down], np.float32) / profiles.across_per_level,
-        lens=np.ascontiguousarray(counts[..., 0], np.int32),
-        lens_count=np.ascontiguousarray(counts[..., 1], np.int32),
-        taps=np.ascontiguousarray(counts[..., 2], np.int32),
-        first_start=first_start,
-        level_start=level_start,
-        first=np.concatenate([strip[3].ravel() for plane in across for strip in plane] + [np.zeros(1, np.int16)]),
-        level=np.concatenate([strip[4].ravel() for plane in across for strip in plane] + [np.zeros(STRIP, np.uint8)]),
-        turn=turns,
-        rim=rim,
-        pixel=pixel,
-        share=share,
-    )
+    @cached_property
+    def axes(self) -> tuple[int, int, int]:
+        """Axes in memory that count rows, planes and columns."""
+        return camera_axes(self.stored, self.camera)
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows, planes and columns."""
+        rows, planes, columns = (self.stored.shape[axis] for axis in self.axes)
+        return rows, planes, columns
+
+    @property
+    def possible(self) -> bool:
+        """Whether the kernels have room for the profiles of a lens, and numbers for its rows and columns."""
+        limit = np.iinfo(np.int16).max
+        values = self.profiles.pixels * MOST_TAPS * PARTS + STRIP
+        return values <= MOST_VALUES and max(self.shape) < limit and all(one is not None for one in self._sampled)
+
+    @property
+    def estimated_bytes(self) -> int:
+        """Memory of the weights and their rays [byte], about."""
+        rows, planes, columns = self.shape
+        each = np.mean([0 if one is None else one.nbytes for one in self._sampled])
+        profiles = self.profiles
+        rays = profiles.ray_rows * self._strips * self._lenses * profiles.pixels * STRIP
+        return int(planes * each + RAY_BYTES * rays + lines_bytes(planes, columns))
+
+    def weights(self, progress: StepProgress) -> SeparableWeights | None:
+        """Integrate the profiles of all planes; None if a pixel sees too many columns of voxels."""
+        planes = self.shape[1]
+        found: list[PlaneProfiles] = []
+        turns = np.empty((planes, self._strips, 2), np.float32)
+        with threadpool_limits(1, "blas"):
+            for plane, model in enumerate(self._models(0, planes)):
+                one, turns[plane] = self._profiles_of(model)
+                if one is None:
+                    return None
+                found.append(one)
+                progress((plane + 1) / planes)
+        pixel, share, rim = self.profiles.rays()
+        return SeparableWeights(
+            voxels=self.stored.shape,
+            axes=self.axes,
+            first_lens=self._first_lens,
+            sensor_shape=self.camera.optics.sensor_shape,
+            ray_rows=self.profiles.ray_rows,
+            first_column=self._first_column,
+            first_row=self._first_row,
+            pixels=self.profiles.pixels,
+            middle=self._middle,
+            turn=turns,
+            rim=rim,
+            pixel=pixel,
+            share=share,
+            **PlaneProfiles.joined(found),
+        )
+
+    @cached_property
+    def _sampled(self) -> list[PlaneProfiles | None]:
+        """Profiles of some planes."""
+        planes = np.unique(np.linspace(0, self.shape[1] - 1, SAMPLED_PLANES).round().astype(int))
+        return [self._profiles_of(next(self._models(int(plane), 1)))[0] for plane in planes]
+
+    def _models(self, first: int, count: int) -> Iterator[np.ndarray]:
+        """Yield the ray models of some planes, row by row."""
+
+        def positions_mm(steps: np.ndarray) -> np.ndarray:
+            """Return places [mm] by indices (plane, row, column)."""
+            along = np.empty(np.shape(steps))
+            along[:, self.axes[1]], along[:, self.axes[0]], along[:, self.axes[2]] = steps.T
+            along[:, self.axes[1]] += first
+            return self.stored.positions_mm(along)
+
+        rows, _, columns = self.shape
+        order = (self.axes[1], self.axes[0], self.axes[2])
+        planes, down, across = (2 - self.stored.order[axis] for axis in order)
+        return grid_models(self.camera, (count, rows, columns), positions_mm, (planes, down, across))
+
+    def _profiles_of(self, model: np.ndarray) -> tuple[PlaneProfiles | None, np.ndarray]:
+        """Return the profiles of a plane, and its turns (strip, 2), from the ray models of its voxels."""
+        rows, _, columns = self.shape
+        part_rows = STRIP // PARTS
+        middle_rows = self._first_lens[1] + part_rows * np.arange(PARTS * self._strips) + (part_rows - 1) / 2
+        seen, turn = _seen_by_parts(self.camera, model.reshape(rows, columns, -1), middle_rows)
+        profiles = self.profiles.of_plane(model, seen.reshape(len(middle_rows) * columns, -1), rows, columns)
+        return profiles, turn.reshape(self._strips, PARTS, 2).mean(1)
+
+    @cached_property
+    def profiles(self) -> Profiles:
+        """The kernels' launcher for this camera."""
+        packed, radius, every = PackedCamera.of(self.camera), _radius_px(self.camera), self._centres
+        return Profiles(
+            packed.camera,
+            packed.lattice,
+            packed.cell_mm,
+            frame=packed.frame,
+            first_lens=self._first_lens,
+            lens_rows=self._lens_rows,
+            first_column=self._first_column,
+            first_row=self._first_row,
+            pixels=int((np.ceil(self._of_strips.max(1) + radius) - self._first_column).max()),
+            ray_rows=int((np.ceil(every[..., 1].max(1) + radius) - self._first_row).max()),
+        )
+
+    @cached_property
+    def _layout(self) -> tuple[tuple[int, int], np.ndarray]:
+        first, centre = microimage_centres(self.camera.optics, self.camera.lattice, _radius_px(self.camera) + 1)
+        i, j = first.tolist()
+        return (i, j), centre
+
+    @property
+    def _first_lens(self) -> tuple[int, int]:
+        return self._layout[0]
+
+    @property
+    def _lens_rows(self) -> int:
+        return len(self._layout[1])
+
+    @property
+    def _lenses(self) -> int:
+        return int(self._layout[1].shape[1])
+
+    @property
+    def _strips(self) -> int:
+        return -(-self._lens_rows // STRIP)
+
+    @cached_property
+    def _centres(self) -> np.ndarray:
+        """Centres of the microimages of whole strips [pixel], shape (lens row, lens, 2)."""
+        centre = self._layout[1]
+        beyond = np.arange(1, self._strips * STRIP - len(centre) + 1)  # rows that fill the last strip
+        more = centre[-1] + beyond[:, None, None] * (centre[-1] - centre[-2] if len(centre) > 1 else 0)
+        return np.concatenate([centre, more])
+
+    @property
+    def _of_strips(self) -> np.ndarray:
+        """Columns of the centres [pixel], shape (strip, lens row of the strip, lens)."""
+        return self._centres[..., 0].reshape(self._strips, STRIP, self._lenses)
+
+    @cached_property
+    def _first_column(self) -> np.ndarray:
+        return np.floor(self._of_strips.min(1) - _radius_px(self.camera)).astype(np.int32)
+
+    @cached_property
+    def _first_row(self) -> np.ndarray:
+        return np.floor(self._centres[..., 1].min(1) - _radius_px(self.camera)).astype(np.int32)
+
+    @property
+    def _middle(self) -> np.ndarray:
+        """`SeparableWeights.middle`."""
+        rows = self._centres[:, self._lenses // 2, 1] - self._first_row
+        lanes = rows.reshape(self._strips, PARTS, STRIP // PARTS).swapaxes(1, 2)  # parts take turns
+        return np.ascontiguousarray(lanes, np.float32).ravel()
 
 
 def _seen_by_parts(

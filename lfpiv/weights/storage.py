@@ -21,15 +21,19 @@ from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
 from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.operator import Weights
+from lfpiv.weights.separable import ray_sets
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
-from lfpiv_kernels.reconstruction.projector import Blocks
+from lfpiv_kernels.reconstruction.projector import Blocks, Projector
+from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
+from lfpiv_kernels.reconstruction.separable_weights import SeparableWeights
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 _HEADER = "weights.json"
 _HASHED_BYTES = 1 << 24
 """Size of the pieces in which arrays are hashed [byte]."""
@@ -56,6 +60,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
         If the folder cannot be written or the disk is full.
     """
     digest = hashlib.blake2b(digest_size=16)
+    stored = {name: _parts_of(weights.projector(name)) for name in weights.cameras}
 
     def put(name: str, value: Any) -> Any:
         """Write an array, or the arrays of a dataclass; return its entry of the header."""
@@ -81,12 +86,8 @@ def save_weights(weights: Weights, folder: Path) -> str:
             "method": weights.method,
             "camera_sums": put("camera_sums", weights.camera_sums),
             "cameras": {
-                name: put(f"camera{number}", weights.projector(name).blocks)
-                for number, name in enumerate(weights.cameras)
-            },
-            "planes": {
-                name: put(f"planes{number}", weights.projector(name).planes)
-                for number, name in enumerate(weights.cameras)
+                name: [kind.__name__, *(put(f"camera{number}.{k}", part) for k, part in enumerate(parts))]
+                for number, (name, (kind, *parts)) in enumerate(stored.items())
             },
         }
         content = digest.hexdigest()
@@ -125,19 +126,36 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
         arrays: dict[str, np.ndarray] = {}
         camera_sums = _map(folder, header["camera_sums"], arrays)
-        blocks = {name: _take(Blocks, folder, entry, arrays) for name, entry in header["cameras"].items()}
-        planes = {
-            name: None if entry is None else _take(PlaneShares, folder, entry, arrays)
-            for name, entry in header["planes"].items()
-        }
+        parts = {}
+        for name, (kind, *entries) in header["cameras"].items():
+            kinds = next(kinds for kinds in _STORED if kinds[0].__name__ == kind)
+            parts[name] = [
+                None if entry is None else _take(one, folder, entry, arrays)
+                for one, entry in zip(kinds, entries, strict=True)
+            ]
         if content not in (None, _content(arrays)):
             raise ValueError("weights of another run")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, StopIteration, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
-    share = DeviceShare(cameras.values(), grid)
-    projectors = {name: share.projector(name, part, planes[name]) for name, part in blocks.items()}
+    share, sets = DeviceShare(cameras.values(), grid), ray_sets(cameras)
+    projectors: dict[str, RayProjector] = {
+        name: SeparableProjector(own[0], sets) if isinstance(own[0], SeparableWeights) else share.projector(name, *own)
+        for name, own in parts.items()
+    }
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
+
+
+_STORED: tuple[tuple[type, ...], ...] = ((Blocks, PlaneShares), (SeparableWeights,))
+"""What is stored of a camera's weights, by the type of the first part."""
+
+
+def _parts_of(projector: RayProjector) -> list[Any]:
+    """Return the type by which the weights of a projector are known, and what is stored of them."""
+    if isinstance(projector, SeparableProjector):
+        return [SeparableWeights, projector.weights]
+    assert isinstance(projector, Projector)
+    return [Blocks, projector.blocks, projector.planes]
 
 
 def _content(arrays: Mapping[str, np.ndarray]) -> str:

@@ -3,6 +3,7 @@
 #define LFPIV_UPDATE_H
 
 #include "pixel_rays.h"
+#include "steps.h"
 
 namespace lfpiv {
 

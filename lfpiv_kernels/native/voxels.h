@@ -7,7 +7,7 @@
 namespace lfpiv {
 
 /// Voxels that a thread of the CPU goes through.
-constexpr int RUN = 1024;
+constexpr int VOXELS_OF_RUN = 1024;
 /// Sums of a thread of the CPU that are independent of each other.
 constexpr int LANES = 8;
 
@@ -17,7 +17,7 @@ LFPIV_INLINE void for_voxels(int run, int size, Body body) {
 #if LFPIV_GPU
     if (run < size) body(run);
 #else
-    const int begin = run * RUN, end = size - begin < RUN ? size : begin + RUN;
+    const int begin = run * VOXELS_OF_RUN, end = size - begin < VOXELS_OF_RUN ? size : begin + VOXELS_OF_RUN;
 #pragma clang loop vectorize(assume_safety)
     for (int voxel = begin; voxel < end; ++voxel) body(voxel);
 #endif

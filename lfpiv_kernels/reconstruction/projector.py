@@ -284,6 +284,10 @@ class Projector(RayProjector):
         rays, weights = zip(*(self.blocks.entries(int(node)) for node in nodes), strict=True)
         return np.concatenate(rays), np.concatenate([own * share for own, share in zip(weights, shares, strict=True)])
 
+    def largest_weight(self) -> float:
+        """Return the largest weight of a ray."""
+        return self.blocks.largest_weight()
+
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32. With planes: a weighted mean of its nodes'."""
         share = self.blocks.microimages.share

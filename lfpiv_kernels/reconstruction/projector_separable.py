@@ -5,6 +5,8 @@ across to rays. Each ray is computed by one thread, and so is each plane of voxe
 on the number of threads. The loops are C++, see ``separable.h``. Twin: ``reference.separable``.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 
@@ -18,11 +20,14 @@ from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, t
 
 wp.set_module_options(native.options("separable.h", contract="fast"))
 
-SEGMENT = 4 * native.constant("separable.h", "LENS_BLOCK")
-"""Lenses in a row whose rays a thread computes."""
-PARTS_OF_LAUNCH = 3 * runtime.CHUNKS
-"""Parts of a launch: more than usual, because the work differs from strip to strip."""
 MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
+"""Most columns of a plane that a pixel sees."""
+LENS_BLOCK: int = native.constant("separable.h", "LENS_BLOCK")
+"""Fewest lenses in a row whose rays a thread computes."""
+LEAST_TASKS = 4
+"""Fewest tasks of a projection for each thread."""
+MOST_VALUES: int = native.constant("separable.h", "MOST_VALUES")
+"""Most values of the profiles across of a lens, which a thread has room for."""
 
 
 @wp.struct
@@ -169,15 +174,31 @@ class SeparableProjector(RayProjector):
     planes = None
     streamed = None
     rests = False
+    takes_rows = True
 
     def __init__(self, weights: SeparableWeights, sets: int):
         super().__init__()
         self.weights, self.ray_sets = weights, sets
         self.form, self.nbytes = weights.form, weights.nbytes
-        rows, planes, columns = weights.shape
-        strides = weights.voxels[1] * weights.voxels[2], weights.voxels[2], 1
+        _, planes, columns = weights.shape
         self._moved = weights.axes[2] != 2
         """Whether columns must be brought together in memory first."""
+        self._arrays = self._on_device(weights)
+        self.rays = zeros(weights.ray_rows * weights.rays_of_row)
+        self.returned = zeros(weights.ray_rows * weights.rays_of_row)
+        self._turned = empty(weights.rays_of_row)
+        self._lines = zeros(lines_bytes(planes, columns) // 4)
+        self.map = self._map_rays()
+
+    @property
+    def microimages(self) -> SeparableWeights:
+        """Pixel and share of each ray."""
+        return self.weights
+
+    def _on_device(self, weights: SeparableWeights) -> Separable:
+        """Return the arrays of weights for the kernels."""
+        rows, planes, columns = weights.shape
+        strides = weights.voxels[1] * weights.voxels[2], weights.voxels[2], 1
         arrays = Separable()
         arrays.rows, arrays.planes, arrays.columns = rows, planes, columns
         arrays.row_stride = planes * columns if self._moved else strides[weights.axes[0]]
@@ -189,24 +210,14 @@ class SeparableProjector(RayProjector):
             *("first_start", "level_start", "first", "level", "turn", "middle", "rim"),
         ):
             setattr(arrays, name, to_device(getattr(weights, name).ravel()))
-        self._arrays = arrays
-        self.rays = zeros(weights.ray_rows * weights.rays_of_row)
-        self.returned = zeros(weights.ray_rows * weights.rays_of_row)
-        self._turned = empty(weights.rays_of_row)
-        self._line_size = (weights.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP
-        self._lines = zeros(runtime.CHUNKS * planes * self._line_size)
-        self.map = self._map_rays()
-
-    @property
-    def device_bytes(self) -> int:
-        """Memory of the weights on a GPU [byte]; 0 on the CPU, where they are those of the host."""
-        return self.weights.nbytes if runtime.device().form == "gpu" else 0
+        return arrays
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
         weights = self.weights
         self.scatter(voxels.ones(int(np.prod(weights.voxels))))
-        sets = RaySets((np.arange(weights.ray_rows) % self.ray_sets).astype(np.uint8), weights.rays_of_row, self.ray_sets)
+        of_row = (np.arange(weights.ray_rows) % self.ray_sets).astype(np.uint8)
+        sets = RaySets(of_row, weights.rays_of_row, self.ray_sets)
         return RayMap(weights, to_host(self.rays), [0, self.rays.size], [0], sets=sets, darken=False)
 
     def _ray_rows(self, ray_set: int) -> range:
@@ -218,10 +229,16 @@ class SeparableProjector(RayProjector):
         light, rows = to_device(volume, float), self._ray_rows(ray_set)
         if self._moved:
             light = _transposed(light, self.weights.voxels, self.weights.axes)
-        segments = -(-self.weights.lenses // SEGMENT)
-        inputs = [self._arrays, light, rows.start, rows.step, SEGMENT]
-        tasks = len(rows) * self.weights.strips * segments
-        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=PARTS_OF_LAUNCH)
+        parts = runtime.CHUNKS
+        segment = self._segment(len(rows) * self.weights.strips)
+        tasks = len(rows) * self.weights.strips * -(-self.weights.lenses // segment)
+        inputs = [self._arrays, light, rows.start, rows.step, segment]
+        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=parts)
+
+    def _segment(self, rows: int) -> int:
+        """Return the lenses in a row whose rays a thread computes: a whole row where there are rows enough."""
+        pieces = -(-LEAST_TASKS * runtime.device().threads // rows)
+        return max(-(-self.weights.lenses // pieces), LENS_BLOCK)
 
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
@@ -230,25 +247,64 @@ class SeparableProjector(RayProjector):
         """
         volume, mask = to_device(out, float), None if active is None else to_device(active, float)
         found = volume if mask is None and not self._moved else zeros(volume.size)
-        lenses = self.weights.strips * self.weights.lenses
-        for row in self._ray_rows(ray_set):
-            launch(Call(_turn, lenses, [self._arrays, self.returned, row], [self._turned]))
-            outputs = [self._lines, found]
-            launch(Call(_gather, self.weights.shape[1], [self._arrays, self._turned, row], outputs, scratch=True), parts=PARTS_OF_LAUNCH)
-        if self._moved:
-            axes, shape = self.weights.axes, self.weights.shape
-            first, second, third = (axes.index(axis) for axis in range(3))
-            found = _transposed(found, shape, (first, second, third))
+        found = self._gather(self._arrays, self.returned, ray_set, found)
         if found is not volume:
             voxels.add(found, volume, mask)
         overwrite(out, volume)
         return out
+
+    def _gather(self, arrays: Separable, rays: wp.array, ray_set: int, out: wp.array) -> wp.array:
+        """Add to `out`, shape (voxel,). Return it in the order of voxels in memory."""
+        lenses, planes = self.weights.strips * self.weights.lenses, self.weights.shape[1]
+        for row in self._ray_rows(ray_set):
+            launch(Call(_turn, lenses, [arrays, rays, row], [self._turned]))
+            outputs = [self._lines, out]
+            launch(Call(_gather, planes, [arrays, self._turned, row], outputs, scratch=True), parts=runtime.CHUNKS)
+        if not self._moved:
+            return out
+        first, second, third = (self.weights.axes.index(axis) for axis in range(3))
+        return _transposed(out, self.weights.shape, (first, second, third))
 
     def darken(self, ray_set: int = ALL) -> None:
         """Make the rays of a set dark that `gather` reads."""
         returned, size = to_host(self.returned), self.weights.rays_of_row
         for row in self._ray_rows(ray_set):
             returned[row * size : (row + 1) * size] = 0.0
+
+    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rays of one voxel and their weights, shapes (entry,)."""
+        volume = np.zeros(int(np.prod(self.weights.voxels)), np.float32)
+        volume[voxel] = 1.0
+        with self.reserved():
+            self.scatter(volume)
+            light = to_host(self.rays)
+            rays = np.flatnonzero(light)
+            return rays, light[rays].copy()
+
+    def count_lit(self) -> np.ndarray:
+        """Count the rays that each voxel lights, shape (voxel,), int32."""
+        weights = self.weights
+        lit = replace(
+            weights,
+            down=(weights.down > 0).astype(np.uint8),
+            level=(weights.level > 0).astype(np.uint8),
+            down_scale=np.ones_like(weights.down_scale),
+            turn=np.zeros_like(weights.turn),
+            rim=np.zeros_like(weights.rim),
+        )
+        with self.reserved():
+            seen = to_device((weights.share > 0).astype(np.float32))
+            count = self._gather(self._on_device(lit), seen, ALL, zeros(int(np.prod(weights.voxels))))
+        return np.rint(to_host(count)).astype(np.int32)
+
+    def largest_weight(self) -> float:
+        """Return the largest weight of a ray: the largest product of two profiles of a plane."""
+        return self.weights.largest
+
+
+def lines_bytes(planes: int, columns: int) -> int:
+    """Return the memory of the lines that the threads of a launch work on [byte]."""
+    return 4 * runtime.CHUNKS * planes * (-(-columns // COLUMN_BLOCK) * COLUMN_BLOCK + MOST_TAPS) * STRIP
 
 
 def _transposed(volume: wp.array, shape: tuple[int, int, int], axes: tuple[int, int, int]) -> wp.array:

@@ -31,6 +31,8 @@ class RayProjector:
     ray_sets: int
     """Sets of rays that can be taken alone."""
 
+    takes_rows = False
+    """Whether sets of rays are rows of pixels under every lens, each of which sees the whole volume."""
     rests: bool
     """Whether dark voxels cost no time."""
     form: str
@@ -75,6 +77,18 @@ class RayProjector:
 
     def darken(self, ray_set: int = ALL) -> None:
         """Make rays of a set dark that the map to pixels does not write."""
+
+    def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""
+        raise NotImplementedError
+
+    def count_lit(self) -> np.ndarray:
+        """Count the rays that each voxel lights, shape (voxel,), int32."""
+        raise NotImplementedError
+
+    def largest_weight(self) -> float:
+        """Return the largest weight of a ray."""
+        raise NotImplementedError
 
     def project(self, volume: Values, out: Given, ray_set: int = ALL) -> Given:
         """Write the image of `volume`, shape (voxel,), by the rays of a set into `out`, shape (pixel,). Return `out`."""

@@ -113,3 +113,16 @@ class SeparableWeights:
         """Memory of all arrays but those of the rays themselves [byte]."""
         arrays = (getattr(self, one.name) for one in fields(self) if one.name not in ("pixel", "share"))
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
+
+    @property
+    def largest(self) -> float:
+        """Largest product of two profiles of a plane."""
+        best = 0.0
+        for plane, scale in enumerate(self.down_scale.tolist()):
+            here = slice(plane, plane + 2)
+            down, level = (
+                array[starts[0] : starts[1] if len(starts) > 1 else None].max(initial=0)
+                for array, starts in ((self.down, self.down_start[here]), (self.level, self.level_start[here, 0]))
+            )
+            best = max(best, scale * float(down) * float(level))
+        return best

@@ -11,16 +11,16 @@ from lfpiv_kernels.reconstruction import pixel_rays_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, PixelRays
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
-from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep_runs
 from lfpiv_kernels.transfer import Values, empty, to_device, zeros
 
 wp.set_module_options(native.options("update.h"))
 
 FEWEST_RUNS = 256
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
-LARGEST_LEAP = 50.0
+LARGEST_LEAP: float = native.constant("steps.h", "LARGEST_LEAP")
 """Largest ratio of two iterates that momentum repeats, and the inverse of the smallest one."""
-SMALLEST = float(np.finfo(np.float32).tiny)
+SMALLEST: float = native.constant("steps.h", "SMALLEST")
 """Least light of an active voxel under momentum: smaller float32 numbers are slow, and a zero would stay zero."""
 
 
@@ -62,32 +62,25 @@ def _compare(
     _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays, rays_out, squares_out, divergence_out)
 
 
-@wp.func
-def _extrapolated(light: float, last: float, exponent: float):
-    """Return light * (light / last)^exponent; zeros of `last` stay zero."""
-    if last > 0.0:
-        ratio = wp.clamp(light / last, 1.0 / LARGEST_LEAP, LARGEST_LEAP)
-        return wp.max(light * wp.pow(ratio, exponent), SMALLEST)
-    return last
-
-
-@wp.func
-def _store(
-    voxel: int,
-    light: float,
+@wp.func_native("""
+    lfpiv::update(
+        run, size, volume.data, exponent.data, step.data, length, over.data, last.data, momentum, stepped_out.data,
+        ahead_out.data
+    );
+""")
+def _update_run(
+    run: int,
+    size: int,
+    volume: wp.array(dtype=float),
+    exponent: wp.array(dtype=float),
+    step: wp.array(dtype=float),
+    length: float,
+    over: wp.array(dtype=float),
     last: wp.array(dtype=float),
     momentum: float,
     stepped_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
-):
-    """Store a voxel's light after a step and, if there was a last one, that to which momentum carries it."""
-    if last.shape[0] > 0:
-        before = last[voxel]
-        lifted = wp.where(before > 0.0, wp.max(light, SMALLEST), light)
-        stepped_out[voxel] = lifted
-        ahead_out[voxel] = _extrapolated(lifted, before, momentum)
-    else:
-        stepped_out[voxel] = light
+): ...
 
 
 @wp.kernel
@@ -100,16 +93,36 @@ def _update(
     over: wp.array(dtype=float),  # times which the exponent counts, if there is any
     last: wp.array(dtype=float),
     momentum: float,
-    first_voxel: int,
+    size: int,
+    first_run: int,
     # out
     stepped_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
 ):
-    voxel = first_voxel + wp.tid()
-    change = exponent[voxel] * length
-    if over.shape[0] > 0:
-        change = change * over[voxel]
-    _store(voxel, volume[voxel] * wp.exp(step[voxel] * change), last, momentum, stepped_out, ahead_out)
+    run = first_run + wp.tid()
+    _update_run(run, size, volume, exponent, step, length, over, last, momentum, stepped_out, ahead_out)
+
+
+@wp.func_native("""
+    lfpiv::sharpen(
+        run, size, volume.data, logarithm.data, blurred.data, share, largest, over.data, last.data, momentum,
+        stepped_out.data, ahead_out.data
+    );
+""")
+def _sharpen_run(
+    run: int,
+    size: int,
+    volume: wp.array(dtype=float),
+    logarithm: wp.array(dtype=float),
+    blurred: wp.array(dtype=float),
+    share: float,
+    largest: float,
+    over: wp.array(dtype=float),
+    last: wp.array(dtype=float),
+    momentum: float,
+    stepped_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
+): ...
 
 
 @wp.kernel
@@ -123,18 +136,27 @@ def _sharpen(
     over: wp.array(dtype=float),  # times which the blurred logarithm counts, if there is any
     last: wp.array(dtype=float),
     momentum: float,
-    first_voxel: int,
+    size: int,
+    first_run: int,
     # out
     stepped_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
 ):
-    voxel = first_voxel + wp.tid()
-    smooth = blurred[voxel]
-    if over.shape[0] > 0:
-        smooth = smooth * over[voxel]
-    step = logarithm[voxel] + share * (logarithm[voxel] - smooth)
-    light = volume[voxel] * wp.exp(wp.clamp(step, -largest, largest))
-    _store(voxel, light, last, momentum, stepped_out, ahead_out)
+    run = first_run + wp.tid()
+    _sharpen_run(
+        run, size, volume, logarithm, blurred, share, largest, over, last, momentum, stepped_out, ahead_out
+    )
+
+
+@wp.func_native("lfpiv::extrapolate(run, size, last.data, exponent, volume_out.data, ahead_out.data);")
+def _extrapolate_run(
+    run: int,
+    size: int,
+    last: wp.array(dtype=float),
+    exponent: float,
+    volume_out: wp.array(dtype=float),
+    ahead_out: wp.array(dtype=float),
+): ...
 
 
 @wp.kernel
@@ -142,13 +164,13 @@ def _extrapolate(
     # in
     last: wp.array(dtype=float),
     exponent: float,
-    first_voxel: int,
+    size: int,
+    first_run: int,
     # out
     volume_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
 ):
-    voxel = first_voxel + wp.tid()
-    _store(voxel, volume_out[voxel], last, exponent, volume_out, ahead_out)
+    _extrapolate_run(first_run + wp.tid(), size, last, exponent, volume_out, ahead_out)
 
 
 @wp.kernel
@@ -272,7 +294,7 @@ def update(
         Where to write. It may be any of the other arrays.
     """
     last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
-    sweep(_update, volume.size, [volume, exponent, step, float(length), over, last, float(momentum)], [stepped, ahead])
+    sweep_runs(_update, [volume, exponent, step, float(length), over, last, float(momentum)], [stepped, ahead])
 
 
 def sharpen(
@@ -292,9 +314,9 @@ def sharpen(
     """
     last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
     inputs = [volume, logarithm, blurred, float(share), float(largest), over, last, float(momentum)]
-    sweep(_sharpen, volume.size, inputs, [stepped, ahead])
+    sweep_runs(_sharpen, inputs, [stepped, ahead])
 
 
 def extrapolate(volume: wp.array, leap: Leap) -> None:
     """Let momentum go on from `volume` as it is after a step. Lifts its numbers as `Leap` says."""
-    sweep(_extrapolate, volume.size, [leap.last, float(leap.exponent)], [volume, leap.ahead])
+    sweep_runs(_extrapolate, [leap.last, float(leap.exponent)], [volume, leap.ahead])

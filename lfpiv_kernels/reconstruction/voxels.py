@@ -11,7 +11,7 @@ from lfpiv_kernels.transfer import empty
 
 wp.set_module_options(native.options("voxels.h"))
 
-RUN: int = native.constant("voxels.h", "RUN")
+VOXELS_OF_RUN: int = native.constant("voxels.h", "VOXELS_OF_RUN")
 """Voxels that a thread of the CPU goes through."""
 FEWEST_VOXELS = 16384
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
@@ -162,38 +162,38 @@ def _part(
 def multiply(one: wp.array, other: wp.array, out: wp.array | None = None, *, factor: float = 1.0) -> wp.array:
     """Return one * factor * other; write it to `out` if given."""
     found = empty(one.size) if out is None else out
-    _run(_multiply, [one, float(factor), other], [found])
+    sweep_runs(_multiply, [one, float(factor), other], [found])
     return found
 
 
 def divide(numerator: wp.array, denominator: wp.array, least: float, out: wp.array | None = None) -> wp.array:
     """Return numerator / max(denominator, least); write it to `out` if given."""
     found = empty(numerator.size) if out is None else out
-    _run(_divide, [numerator, denominator, float(least)], [found])
+    sweep_runs(_divide, [numerator, denominator, float(least)], [found])
     return found
 
 
 def indicator(volume: wp.array) -> wp.array:
     """Return 1 where the volume is not 0, else 0."""
     lit = empty(volume.size)
-    _run(_indicate, [volume], [lit])
+    sweep_runs(_indicate, [volume], [lit])
     return lit
 
 
 def add(added: wp.array, out: wp.array, mask: wp.array | None = None) -> None:
     """Add a volume to `out`, where `mask` is not 0 if one is given."""
-    _run(_add, [added, mask], [out])
+    sweep_runs(_add, [added, mask], [out])
 
 
 def replace_resting(out: wp.array, values: wp.array, active: wp.array) -> None:
     """Overwrite `out` by `values` where `active` is 0."""
-    _run(_replace, [active, values], [out])
+    sweep_runs(_replace, [active, values], [out])
 
 
 def part_bright(light: wp.array, least: wp.array, share: float = 1.0) -> wp.array:
     """Return 1 for voxels with light of at least share * `least`, shape (1,), else 0. Leave the others' in `light`."""
     active = empty(light.size)
-    _run(_part, [least, float(share)], [light, active])
+    sweep_runs(_part, [least, float(share)], [light, active])
     return active
 
 
@@ -204,10 +204,10 @@ def ones(size: int) -> wp.array:
     return found
 
 
-def _run(kernel: wp.Kernel, inputs: list[object], outputs: list[wp.array]) -> None:
-    """Launch a kernel on all runs of voxels."""
+def sweep_runs(kernel: wp.Kernel, inputs: list[object], outputs: list[wp.array | None]) -> None:
+    """Launch a kernel on all runs of voxels of the first output, whose number is a further input."""
     size = outputs[0].size
-    runs = size if runtime.device().form == "gpu" else -(-size // RUN)
+    runs = size if runtime.device().form == "gpu" else -(-size // VOXELS_OF_RUN)
     launch(Call(kernel, runs, [*inputs, size], outputs), parts=parts_of(size, FEWEST_VOXELS))
 
 

@@ -6,7 +6,10 @@ import numpy as np
 from scipy import sparse
 
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
+
+LOOKED_AT = 16384
+"""Voxels among whose weights the largest one is looked for at once."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,3 +104,37 @@ class Blocks:
         lit = weight > 0
         shape = len(self.scale), int(np.prod(self.microimages.sensor_shape))
         return sparse.coo_array((weight[lit], (voxel[lit], self.microimages.pixel[ray[lit]])), shape).tocsr()
+
+    def largest_weight(self) -> float:
+        """Return the largest weight of a ray. A pixel that a voxel reaches through two lenses has two rays."""
+        order = 2 if self.form == "profiles" else 1
+        share = self.microimages.share
+        bound = self.scale.astype(np.float64) * LEVELS**order * share.max(initial=0.0)
+        best = 0.0
+        firsts = np.arange(0, len(bound), LOOKED_AT)
+        for first in firsts[np.argsort(-np.maximum.reduceat(bound, firsts))] if len(firsts) else ():
+            last = min(first + LOOKED_AT, len(bound))
+            if bound[first:last].max() <= best:
+                break
+            bound[first:last] *= self._levels(first, last) / LEVELS**order
+            for voxel in first + np.argsort(-bound[first:last]):
+                if bound[voxel] <= best:
+                    break
+                ray, weight = self.entries(int(voxel))
+                best = max(best, float((weight * share[ray]).max(initial=0.0)))
+        return best
+
+    def _levels(self, first: int, last: int) -> np.ndarray:
+        """Return the largest level of each voxel from `first` to `last`. With profiles it is a product of two levels."""
+        some = slice(self.first_block[first], self.first_block[last])
+        width, height = (array[some].astype(np.int64) for array in (self.width, self.height))
+        largest = np.zeros(last - first)
+        if not len(width):
+            return largest
+        profiles = self.form == "profiles"
+        sizes = np.stack([width, height], axis=1).ravel() if profiles else width * height
+        level = self.value[self.first_value[first] : self.first_value[last]]
+        tops = np.maximum.reduceat(level, np.cumsum(sizes) - sizes).astype(float)
+        of_voxel = np.repeat(np.arange(last - first), np.diff(self.first_block[first : last + 1]))
+        np.maximum.at(largest, of_voxel, tops[::2] * tops[1::2] if profiles else tops)
+        return largest

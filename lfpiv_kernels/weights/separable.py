@@ -9,6 +9,9 @@ plane has few different profiles [1]_. The loops are C++, see ``separable_weight
    IEEE Trans. Med. Imaging 29 (2010) 1839-1850, doi:10.1109/TMI.2010.2050898.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
@@ -25,8 +28,8 @@ MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
 """Most columns of a plane that a pixel sees."""
 COMPILED_TAPS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)
 """Numbers of columns for which there are loops, see ``with_taps``."""
-LARGEST = 1.1
-"""Largest value of a profile across: rays gather where light converges on the array."""
+LEAST = 0.5 / LEVELS
+"""Least value of a profile across that is stored. A ray that sees nothing but a voxel has 1."""
 
 
 @wp.struct
@@ -231,9 +234,6 @@ class Profiles:
         Columns and rows of pixels under a lens.
     """
 
-    across_per_level = LEVELS / LARGEST
-    """Levels of a profile across of 1."""
-
     def __init__(self, camera, lattice, cell_mm, *, frame, first_lens, lens_rows, first_column, first_row, pixels, ray_rows):
         geometry = np.concatenate([camera.to_numpy(), lattice.to_numpy(), [cell_mm], np.ravel(frame)], dtype=np.float32)
         self._inputs = Inputs()
@@ -244,7 +244,7 @@ class Profiles:
         self._layout = RayLayout()
         self._layout.first_column, self._layout.first_row = _on_cpu(first_column.ravel()), _on_cpu(first_row)
         self._layout.strips, self._layout.lenses = first_column.shape
-        self._layout.pixels, self._layout.ray_rows = pixels, ray_rows
+        self._layout.pixels, self._layout.ray_rows = self.pixels, self.ray_rows = pixels, ray_rows
 
     def rays(self):
         """Return sensor pixel, share and rim of all rays, see ``SeparableWeights``."""
@@ -255,27 +255,41 @@ class Profiles:
         _launch(_write_rays, runs, [self._inputs, layout], [_on_cpu(one) for one in (pixel, share, rim)])
         return pixel, share, rim
 
-    def down(self, models, rows, columns):
-        """Compute the profiles down of a plane.
+    def of_plane(self, models, seen, rows, columns):
+        """Compute the profiles of a plane.
 
         Parameters
         ----------
         models : ndarray, shape (rows * columns, MODEL_SIZE), float32
             Ray models of its voxels, row by row.
+        seen : ndarray, shape (strip * PARTS * columns, MODEL_SIZE), float32
+            Ray models of the columns where the middle row of lenses of each part of a strip sees them.
         rows, columns : int
             Its voxels.
 
         Returns
         -------
-        first : ndarray, shape (ray row, strip, block, STRIP), int16
-            First row of voxels; -1 for none.
-        levels : ndarray, flat, uint8
-            Levels of `taps` x COLUMN_BLOCK voxels for each.
-        taps : int
-            Rows of voxels in a profile.
-        scale : float
-            Weight of one level.
+        PlaneProfiles or None
+            None if a pixel sees more than `MOST_TAPS` columns.
         """
+        down_first, down, down_taps, down_scale = self._down(models, rows, columns)
+        across = self._across(seen, columns)
+        if across is None:
+            return None
+        lens, first, values = across
+        per_level = LEVELS / max(max((float(one.max(initial=0.0)) for one in values), default=0.0), LEAST)
+        return PlaneProfiles(
+            down_first=down_first,
+            down=down,
+            down_taps=down_taps,
+            scale=down_scale / per_level,
+            lens=lens,
+            first=first,
+            level=[np.rint(one * per_level).astype(np.uint8) for one in values],
+        )
+
+    def _down(self, models, rows, columns):
+        """Return first rows of voxels, levels, taps and the weight of a level, see `PlaneProfiles`."""
         layout, blocks = self._layout, -(-columns // COLUMN_BLOCK)
         self._inputs.model = _on_cpu(np.ascontiguousarray(models, np.float32).ravel())
         inputs = [self._inputs, layout, rows, columns, blocks]
@@ -293,43 +307,80 @@ class Profiles:
             _launch(_fill, blocks, [*inputs, per_level, taps, _on_cpu(first.ravel())], [_on_cpu(levels)])
         return first, levels, taps, 1 / per_level
 
-    def across(self, models, columns):
-        """Compute the profiles across of a plane for all strips.
+    def _across(self, models, columns):
+        """Return first lens, number of lenses and taps of each strip, shape (strip, 3), then first columns and values.
 
-        Parameters
-        ----------
-        models : ndarray, shape (strip * PARTS * columns, MODEL_SIZE), float32
-            Ray models of the columns where the middle row of lenses of each part of a strip sees them.
-        columns : int
-            Columns of the plane.
-
-        Returns
-        -------
-        list of tuple
-            First lens, number of lenses, taps, first columns (lens, pixel), int16, and levels (lens, pixel, tap,
-            part), uint8, of each strip. Taps are 0 without any lens.
-
-        Raises
-        ------
-        ValueError
-            If a pixel sees more than `MOST_TAPS` columns.
+        None if a pixel sees more than `MOST_TAPS` columns.
         """
         layout = self._layout
         self._inputs.model = _on_cpu(np.ascontiguousarray(models, np.float32).ravel())
         lens = np.zeros((layout.strips, 3), np.int32)
         first = np.full((layout.strips, layout.lenses, layout.pixels), -1, np.int16)
         value = np.zeros((*first.shape, MOST_TAPS, PARTS), np.float32)
-        outputs = [_on_cpu(array.ravel()) for array in (lens, first, value)]
-        _launch(_across, layout.strips, [self._inputs, layout, columns, 0.5 / self.across_per_level], outputs)
-        found = []
+        _launch(
+            _across,
+            layout.strips,
+            [self._inputs, layout, columns, LEAST],
+            [_on_cpu(array.ravel()) for array in (lens, first, value)],
+        )
+        columns_of, values = [], []
         for number, (low, count, taps) in enumerate(lens.tolist()):
             if taps > MOST_TAPS:
-                raise ValueError(f"voxels: a pixel sees more than {MOST_TAPS} voxels side by side.")
+                return None
             taps = min((one for one in COMPILED_TAPS if one >= taps), default=taps) if count else 0
+            lens[number] = low if count else 0, count, taps
             some = slice(low, low + count)
-            level = np.minimum(np.rint(value[number, some, :, :taps] * self.across_per_level), LEVELS).astype(np.uint8)
-            found.append((low if count else 0, count, taps, _within(first[number, some]), level))
-        return found
+            columns_of.append(_within(first[number, some]))
+            values.append(value[number, some, :, :taps])
+        return lens, columns_of, values
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneProfiles:
+    """The profiles of one plane, see ``SeparableWeights``."""
+
+    down_first: np.ndarray
+    """First row of voxels, shape (ray row, strip, block, STRIP), int16; -1 for none."""
+    down: np.ndarray
+    """Levels of `down_taps` x COLUMN_BLOCK voxels for each, flat, uint8."""
+    down_taps: int
+    """Rows of voxels in a profile down."""
+    scale: float
+    """Weight of one level down times one level across."""
+    lens: np.ndarray
+    """First lens, number of lenses and taps of each strip, shape (strip, 3), int32."""
+    first: list[np.ndarray]
+    """Of each strip first columns, shape (lens, pixel), int16."""
+    level: list[np.ndarray]
+    """Of each strip levels, shape (lens, pixel, tap, PARTS), uint8."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays [byte]."""
+        return self.down_first.nbytes + self.down.nbytes + sum(one.nbytes for one in (*self.first, *self.level))
+
+    @staticmethod
+    def joined(planes: "Sequence[PlaneProfiles]") -> dict[str, np.ndarray]:
+        """Return the fields of ``SeparableWeights`` that hold profiles, from those of all planes."""
+
+        def starts(sizes):
+            return np.concatenate([[0], np.cumsum(np.ravel(sizes))[:-1]]).reshape(np.shape(sizes)).astype(np.int64)
+
+        lens = np.stack([one.lens for one in planes])
+        return {
+            "down_first": np.stack([one.down_first for one in planes]),
+            "down": np.concatenate([one.down for one in planes] + [np.zeros(STRIP, np.uint8)]),
+            "down_start": starts([one.down.size for one in planes]),
+            "down_taps": np.array([one.down_taps for one in planes], np.int32),
+            "down_scale": np.array([one.scale for one in planes], np.float32),
+            "lens": np.ascontiguousarray(lens[..., 0]),
+            "lens_count": np.ascontiguousarray(lens[..., 1]),
+            "taps": np.ascontiguousarray(lens[..., 2]),
+            "first_start": starts([[strip.size for strip in one.first] for one in planes]),
+            "level_start": starts([[strip.size for strip in one.level] for one in planes]),
+            "first": np.concatenate([strip.ravel() for one in planes for strip in one.first] + [np.zeros(1, np.int16)]),
+            "level": np.concatenate([strip.ravel() for one in planes for strip in one.level] + [np.zeros(STRIP, np.uint8)]),
+        }
 
 
 def _within(first):

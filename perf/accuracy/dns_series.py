@@ -43,7 +43,7 @@ from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate
-from lfpiv_kernels.reconstruction.projector import ALL
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 
 TITLE = "Time series of a turbulent flow"
 
@@ -133,9 +133,17 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
         counts.passes += 0.5 * (len(self.cameras) == cameras)
         return of(self, *arguments)
 
-    def part(of: Any, self: ImageEquations, camera: int, lenses: int, *arguments: Any) -> Any:
-        counts.passes += (0.5 if lenses == ALL else 0.25) / cameras * (len(self.cameras) == cameras)
-        return of(self, camera, lenses, *arguments)
+    def half_of(equations: ImageEquations, camera: int, ray_set: int) -> float:
+        sets = 1 if ray_set == ALL else equations.cameras[camera].projector.ray_sets
+        return 0.5 / sets / cameras * (len(equations.cameras) == cameras)
+
+    def part(of: Any, self: ImageEquations, camera: int, ray_set: int, *arguments: Any) -> Any:
+        counts.passes += half_of(self, camera, ray_set)
+        return of(self, camera, ray_set, *arguments)
+
+    def back(of: Any, self: ImageEquations, parts: Sequence[tuple[int, int]], *arguments: Any) -> Any:
+        counts.passes += sum(half_of(self, *one) for one in parts)  # the comparisons are counted by themselves
+        return of(self, parts, *arguments)
 
     def guess(of: Any, views: Sequence[Any], *arguments: Any) -> Any:
         counts.passes += len(views) == cameras
@@ -152,8 +160,8 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
             (SmartSolver, "prepare", prepare),
             (ImageEquations, "compare", half),
             (ImageEquations, "back_project", half),
-            (ImageEquations, "compare_subset", part),
-            (ImageEquations, "back_project_subset", part),
+            (ImageEquations, "compare_part", part),
+            (ImageEquations, "exponent_of", back),
             (instant, "multiplicative_guess", guess),
             (Reconstructor, "instant", timed),
             (Reconstructor, "follow", timed),

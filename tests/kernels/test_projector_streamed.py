@@ -5,7 +5,8 @@ import pytest
 from support.random_blocks import VOXELS, matrix_of, random_blocks
 
 from lfpiv_kernels.reconstruction import projector_streamed
-from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole, least_bytes, slab_edges
 from lfpiv_kernels.transfer import count_transfers, to_device, to_host

@@ -10,7 +10,8 @@ from support.ideal_rig import two_cameras
 import lfpiv
 from lfpiv_kernels.lanes import LANES
 from lfpiv_kernels.reconstruction import voxels
-from lfpiv_kernels.reconstruction.projector import ALL, Projector
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.transfer import zeros
 

@@ -19,7 +19,8 @@ from lfpiv.reconstruction.steps import SmartStep
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.reconstruction import update as kernels
-from lfpiv_kernels.reconstruction.projector import ALL, EVEN, ODD
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 from lfpiv_kernels.transfer import to_device, to_host
 
 TOLERANCE_SUM = 1e-6  # float32 sums of the same terms in another order, of the brightest pixel
@@ -44,7 +45,7 @@ def volume_of_blobs():
 
 def test_subsets_partition_the_pixels_that_see_one_half(weights):
     for name in weights.cameras:
-        even, odd, every = (set(weights.projector(name).see_only(lenses)) for lenses in (EVEN, ODD, ALL))
+        even, odd, every = (set(weights.projector(name).see_only(part)) for part in (EVEN, ODD, ALL))
         assert not even & odd and even | odd <= every
         assert len(even | odd) > 0.9 * len(every)
 
@@ -77,30 +78,58 @@ def test_halves_add_up_to_the_projection_and_to_the_back_projection(weights):
         np.testing.assert_allclose(back[1] + back[2], back[0], atol=TOLERANCE_SUM * back[0].max())
 
 
-@pytest.mark.parametrize("lenses", [EVEN, ODD])
-def test_each_half_is_adjoint_to_its_back_projection(weights, lenses):
+@pytest.mark.parametrize("half", [EVEN, ODD])
+def test_each_half_is_adjoint_to_its_back_projection(weights, half):
     rng = np.random.default_rng(2)
     for name, camera in weights.cameras.items():
         volume = rng.normal(size=weights.grid.size).astype(np.float32)
         image = rng.normal(size=camera.gain.size).astype(np.float32)
         projector = weights.projector(name)
-        forth = projector.project(volume, np.zeros_like(image), lenses)
-        back = projector.back_project(image, np.zeros_like(volume), lenses)
+        forth = projector.project(volume, np.zeros_like(image), half)
+        back = projector.back_project(image, np.zeros_like(volume), half)
         products = np.vdot(forth.astype(float), image), np.vdot(back.astype(float), volume)
         norms = float(np.linalg.norm(forth) * np.linalg.norm(image))
         assert abs(products[0] - products[1]) < TOLERANCE_ADJOINT * norms
 
 
-def test_epochs_equal_their_dense_twin(weights):
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize(
+    ("sets", "count"), [(1, 1), (2, 2), (3, 3), (5, 5), (8, 8), (13, 13), (64, 64), (16, 4), (13, 5), (7, 1)]
+)
+def test_joint_subsets_are_each_set_of_all_cameras_once_in_bit_reversed_order(cameras, sets, count):
+    order = [0]
+    while len(order) < count:  # even numbers before odd ones, and so on within each: the halves of half as many
+        order = [2 * number for number in order] + [2 * number + 1 for number in order]
+    expected = [number for number in order if number < count]
+    subsets = ordered_subsets.joint_subsets(cameras, sets, count)
+    assert [one.parts[0] for one in subsets] == [(0, number) for number in expected]
+    for subset, first in zip(subsets, expected, strict=True):
+        assert subset.parts == tuple((n, number) for n in range(cameras) for number in range(first, sets, count))
+    parts = [part for one in subsets for part in one.parts]
+    assert sorted(parts) == [(camera, number) for camera in range(cameras) for number in range(sets)]
+
+
+def test_subsets_are_each_set_of_each_camera_once_or_whole_cameras():
+    assert [one.parts for one in ordered_subsets.subsets_of(2, 2)] == [((n, half),) for n in (0, 1) for half in (0, 1)]
+    assert [one.parts for one in ordered_subsets.subsets_of(3)] == [((n, ALL),) for n in range(3)]
+
+
+@pytest.mark.parametrize(
+    "subsets",
+    [ordered_subsets.subsets_of(2, 2), ordered_subsets.subsets_of(2), ordered_subsets.joint_subsets(2, 2, 2)],
+    ids=["halves", "cameras", "joint"],
+)
+def test_epochs_equal_their_dense_twin(weights, subsets):
     rng, floor = np.random.default_rng(4), 0.5
     first = rng.uniform(50, 200, weights.grid.size).astype(np.float32)
-    names, subsets = list(weights.cameras), ordered_subsets.subsets_of(2, True)
+    names = list(weights.cameras)
     images = {name: rng.uniform(0, 20, camera.gain.size).astype(np.float32) for name, camera in weights.cameras.items()}
     dense = [reference.dense(weights.projector(name).blocks) for name in names]
-    pixels = [weights.projector(names[one.camera]).see_only(one.lenses) for one in subsets]
+    pixels = [[(n, weights.projector(names[n]).see_only(part)) for n, part in one.parts] for one in subsets]
+    rows = [np.concatenate([dense[n][seen] for n, seen in each]) for each in pixels]
     twin = reference.ordered_subsets(
-        [dense[one.camera][seen] for one, seen in zip(subsets, pixels, strict=True)],
-        [images[names[one.camera]][seen] for one, seen in zip(subsets, pixels, strict=True)],
+        rows,
+        [np.concatenate([images[names[n]][seen] for n, seen in each]) for each in pixels],
         first.astype(float),
         column_sum=sum(matrix.sum(0) for matrix in dense),
         epochs=3,
@@ -117,7 +146,7 @@ def test_epochs_equal_their_dense_twin(weights):
         ]
     )
     sieve, column_sum = Sieve(0.0, weights.stored.shape), sum(matrix.sum(0) for matrix in dense).astype(np.float32)
-    sums = [dense[one.camera][seen].sum(0).astype(np.float32) for one, seen in zip(subsets, pixels, strict=True)]
+    sums = [matrix.sum(0).astype(np.float32) for matrix in rows]
     sizes = ordered_subsets.step_sizes(column_sum, sums, np.ones(len(first), bool))
     state = State(to_device(first), momentum.Momentum(to_device(first)), ())
     partition = ordered_subsets.Partition(subsets, tuple(SmartStep(to_device(size), sieve) for size in sizes))
@@ -147,8 +176,11 @@ def test_agreement_is_the_number_of_subsets_for_one_will_and_nothing_for_opposit
     assert agreement(exponents[0] + dark, exponents[0] - dark) == pytest.approx(2, rel=1e-6)
 
 
-def epochs_of(weights, images, partitions, epochs):
-    """Numbers of subsets of the epochs, from an even volume on; `partitions` are tuples of subsets."""
+def epochs_of(weights, images, partitions, epochs, last_conflict=0.0):
+    """Numbers of subsets of the epochs, from an even volume on; `partitions` are tuples of subsets.
+
+    All but the last are left where they conflict, and the last one where it agrees less than `last_conflict`.
+    """
     names, even_gain = list(weights.cameras), {name: weights.gain(name) for name in weights.cameras}
     equations = ImageEquations(
         [
@@ -158,10 +190,12 @@ def epochs_of(weights, images, partitions, epochs):
     )
     sieve, lit = Sieve(0.0, weights.stored.shape), np.ones(weights.grid.size, bool)
     made = []
-    for subsets in partitions:
-        sums = [weights.sums_of_lenses(names[one.camera], one.lenses) for one in subsets]
+    for number, subsets in enumerate(partitions):
+        sums = [sum(weights.sums_of_set(names[camera], part) for camera, part in one.parts) for one in subsets]
         sizes = ordered_subsets.step_sizes(weights.camera_sums.sum(0), sums, lit)
-        made.append(ordered_subsets.Partition(subsets, tuple(SmartStep(to_device(size), sieve) for size in sizes)))
+        conflict = ordered_subsets.CONFLICT if number + 1 < len(partitions) else last_conflict
+        in_turn = tuple(SmartStep(to_device(size), sieve) for size in sizes)
+        made.append(ordered_subsets.Partition(subsets, in_turn, conflict=conflict))
     first = to_device(np.full(weights.grid.size, 1e3, np.float32))
     state = State(first, momentum.Momentum(first), ())
     with equations.locked():
@@ -173,7 +207,7 @@ def test_subsets_that_conflict_are_followed_by_larger_ones(weights):
     """Images of a volume are explained by all subsets, images of noise by none."""
     rng = np.random.default_rng(8)
     halves, cameras, one = (
-        ordered_subsets.subsets_of(2, True), ordered_subsets.subsets_of(2, False), ordered_subsets.subsets_of(1, False)
+        ordered_subsets.subsets_of(2, 2), ordered_subsets.subsets_of(2), ordered_subsets.subsets_of(1)
     )  # fmt: skip
     truth = rng.uniform(500, 2e3, weights.grid.shape).astype(np.float32)
     explained = {name: image.reshape(-1) for name, image in weights(truth).items()}
@@ -183,6 +217,9 @@ def test_subsets_that_conflict_are_followed_by_larger_ones(weights):
     assert len(found) == 6 and found[0] == 4 and found[-1] == 2 and found == sorted(found, reverse=True)
     assert epochs_of(weights, noise, [halves], 6) == [4] * 6
     assert epochs_of(weights, noise, [halves, one], 6) == [4] * found.count(4)
+    left = {"last_conflict": ordered_subsets.CONFLICT}
+    assert epochs_of(weights, noise, [halves], 6, **left) == [4] * found.count(4)
+    assert epochs_of(weights, explained, [halves], 4, **left) == [4] * 4
 
 
 def unlike_bright(weights, truth, deviation):
@@ -213,12 +250,12 @@ def test_a_change_of_the_subsets_is_no_stop_by_tolerance(volume_of_blobs):
     assert found.attrs["misfit"] == never.attrs["misfit"]
 
 
-def test_sums_of_lenses_are_those_of_the_dense_weights(weights):
+def test_sums_of_sets_are_those_of_the_dense_weights(weights):
     for name, camera in weights.cameras.items():
-        for lenses in (EVEN, ODD):
-            pixels = weights.projector(name).see_only(lenses)
+        for half in (EVEN, ODD):
+            pixels = weights.projector(name).see_only(half)
             expected = camera.gain.ravel()[pixels] @ reference.dense(weights.projector(name).blocks)[pixels]
-            np.testing.assert_allclose(weights.sums_of_lenses(name, lenses), expected, rtol=1e-4, atol=1e-6)
+            np.testing.assert_allclose(weights.sums_of_set(name, half), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_truth_is_a_fixed_point_of_subsets(weights):

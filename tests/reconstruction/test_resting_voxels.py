@@ -14,6 +14,7 @@ from lfpiv.reconstruction.particle_size import ParticleSizer
 from lfpiv.reconstruction.resting_voxels import RestingVoxels, leave_out, without_dark
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 from lfpiv_kernels.reconstruction.sums import brightest_share
 from lfpiv_kernels.transfer import to_device, to_host
@@ -106,20 +107,20 @@ def test_light_at_rest_counts_until_it_is_released(equations):
         whole, back = equations.compare(every), to_host(equations.back_project(bright)).copy()
         equations.hold(dark)
         held, from_held = equations.compare(bright), to_host(equations.back_project(bright))
-        halves = [_of_half(equations, lenses, bright) for lenses in (EVEN, ODD)]
+        halves = [_of_half(equations, half, bright) for half in (EVEN, ODD)]
         equations.release()
         released = equations.compare(bright)
-        expected = [_of_half(equations, lenses, every) for lenses in (EVEN, ODD)]
+        expected = [_of_half(equations, half, every) for half in (EVEN, ODD)]
     assert held.divergence == pytest.approx(whole.divergence, rel=TOLERANCE_MISFIT)
     assert halves == pytest.approx(expected, rel=TOLERANCE_MISFIT)
     np.testing.assert_allclose(from_held, back, atol=1e-4 * np.abs(back).max())
     assert abs(released.divergence - whole.divergence) > 0.01 * whole.divergence
 
 
-def _of_half(equations, lenses, volume):
+def _of_half(equations, half, volume):
     """The misfit of one camera's half."""
     equations.begin()
-    equations.compare_subset(0, lenses, volume)
+    equations.compare_part(0, half, volume)
     return equations.measured().divergence
 
 
@@ -177,9 +178,9 @@ def test_volumes_are_as_good_with_fewer_voxels_visited(recorded, monkeypatch):
     visited = []  # voxels
     gather = type(weights.projector("cam1")).gather
 
-    def counted(self, out, active=None, lenses=2):
+    def counted(self, out, active=None, ray_set=ALL):
         visited.append(out.size if active is None else np.count_nonzero(active.numpy()))
-        return gather(self, out, active, lenses)
+        return gather(self, out, active, ray_set)
 
     monkeypatch.setattr(type(weights.projector("cam1")), "gather", counted)
     rested = lfpiv.reconstruct(weights, images, **settings)

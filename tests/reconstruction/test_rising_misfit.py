@@ -73,8 +73,9 @@ def small(device):
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0.3), size_mm=(0.5, 0.4, 0.3), voxel_mm=0.1)
     weights = lfpiv.build_weights(two_cameras(optics=optics(rows=200, columns=240)), grid)
     truth = np.random.default_rng(1).uniform(500, 2e3, grid.shape).astype(np.float32)
-    subsets = ordered_subsets.subsets_of(2, True)
-    sums = [weights.sums_of_lenses(list(weights.cameras)[one.camera], one.lenses) for one in subsets]
+    subsets = ordered_subsets.subsets_of(2, 2)
+    names = list(weights.cameras)
+    sums = [weights.sums_of_set(names[camera], part) for one in subsets for camera, part in one.parts]
     sizes = ordered_subsets.step_sizes(weights.camera_sums.sum(0), sums, np.ones(grid.size, bool))
     return weights, {name: image.reshape(-1) for name, image in weights(truth).items()}, subsets, sizes
 
@@ -116,7 +117,7 @@ def test_an_epoch_that_raises_the_misfit_is_undone_and_safer_steps_follow(small)
 def test_without_safer_steps_larger_subsets_follow_a_rise_and_then_whole_passes(small):
     weights, _, _, _ = small
     assert [one[2:] for one in epochs_of(small, -0.2)] == [(4, False), (4, False)]  # the second is undone, and ends
-    cameras = ordered_subsets.subsets_of(2, False)
+    cameras = ordered_subsets.subsets_of(2)
     size = to_device(np.float32(-0.2) / weights.camera_sums.sum(0))
     step = steps.SmartStep(size, Sieve(0.0, weights.stored.shape))
     found = epochs_of(small, -0.2, following=[ordered_subsets.Partition(cameras, (step, step))])

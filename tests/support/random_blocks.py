@@ -3,7 +3,8 @@
 import numpy as np
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction.projector import ALL, Blocks
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights.microimages import LAYERS, lens_rays
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, ROW_GROUP
 

@@ -232,7 +232,7 @@ def test_halves_of_the_lenses_add_up(both):
     projector = both[0].projector("cam1")
     volume = np.random.default_rng(4).random(GRID.size).astype(np.float32)
     pixels = np.empty(int(np.prod(projector.microimages.sensor_shape)), np.float32)
-    even, odd, every = (projector.project(volume, pixels.copy(), *lenses) for lenses in ((EVEN,), (ODD,), ()))
+    even, odd, every = (projector.project(volume, pixels.copy(), *part) for part in ((EVEN,), (ODD,), ()))
     np.testing.assert_allclose(even + odd, every, atol=1e-5 * every.max())
 
 

@@ -21,7 +21,7 @@ from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import native, reference, runtime
 from lfpiv_kernels.rays import count as trace
 from lfpiv_kernels.rays.lattice import cell_frame, cell_rectangles, pack_lattice
-from lfpiv_kernels.reconstruction.pixel_rays import RayMap
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.weights import footprint, microimages
 from lfpiv_kernels.weights import ray_model as raymodel
 from lfpiv_kernels.weights.microimages import LAYERS
@@ -206,15 +206,24 @@ def test_rays_lie_where_their_lenses_put_them(layout, f_number):
     assert (covered[(row * 130 + column)[seen & lit]] > 0).all()
 
 
-@pytest.mark.parametrize("two_sets", [False, True])
-def test_a_pixel_knows_its_rays(small, two_sets):
+@pytest.mark.parametrize("divided", ["not at all", "by lenses", "at random"])
+def test_a_pixel_knows_its_rays(small, divided):
     """Light of the camera's rays in three parts of memory, of which neighbours overlap."""
     rays = small.cameras["cam1"].microimages
+    row, column = np.divmod(np.arange(rays.size) // rays.edge**2, rays.lenses)
+    if divided == "not at all":
+        sets, set_of = RaySets.single(rays.size), np.zeros(rays.size, int)
+    elif divided == "by lenses":
+        odd = np.indices(rays.corner.shape[:2]).sum(0) % 2  # (lens along j, lens along i)
+        sets, set_of = RaySets.of_lenses(rays), odd[row // LAYERS % len(odd), column]  # rays beyond the last lens
+    else:
+        of_group = np.random.default_rng(10).integers(0, 5, -(-rays.size // 77)).astype(np.uint8)
+        sets, set_of = RaySets(of_group, 77, 5), np.repeat(of_group, 77)[: rays.size].astype(int)
     third = rays.size // 3
     starts, ends = np.array([0, third - 900, 2 * third - 900]), np.array([third, 2 * third, rays.size])
     parts = np.concatenate([[0], np.cumsum(ends - starts)])
     light = (np.random.default_rng(9).random(parts[-1]) < 0.2).astype(np.float32)
-    ray_map = RayMap(rays, light, parts, starts, two_sets=two_sets)
+    ray_map = RayMap(rays, light, parts, starts, sets=sets)
     found, place = ray_map.rays, np.flatnonzero(light)
     part = np.searchsorted(parts, place, side="right") - 1
     ray = place - parts[part] + starts[part]
@@ -222,16 +231,18 @@ def test_a_pixel_knows_its_rays(small, two_sets):
     lit = rays.share[ray] > 0
     np.testing.assert_array_equal(found.dark.numpy(), place[~lit])
     pixel, first = np.unique(rays.pixel[ray[lit]], return_index=True)
-    odd = two_sets * (np.indices(rays.corner.shape[:2]).sum(0) % 2)  # (lens along j, lens along i)
-    row, column = np.divmod(ray[lit] // rays.edge**2, rays.lenses)
-    sees_odd = np.isin(pixel, rays.pixel[ray[lit]][odd[row // LAYERS % len(odd), column] == 1])
-    sees_even = np.isin(pixel, rays.pixel[ray[lit]][odd[row // LAYERS % len(odd), column] == 0])
-    np.testing.assert_array_equal(
-        ray_map.pixel, pixel[np.lexsort((first, sees_odd.astype(int) + (sees_odd & sees_even)))]
-    )
-    ends = [(one.start, one.end) for one in ray_map.of_lenses]
-    even, both = int((~sees_odd).sum()), int((sees_odd & sees_even).sum())
-    assert ends == [(0, even), (even, len(pixel) - both)]
+    sees = np.stack([np.isin(pixel, rays.pixel[ray[lit]][set_of[ray[lit]] == one]) for one in range(sets.count)])
+    own = np.where(sees.sum(0) == 1, sees.argmax(0), sets.count)  # those that see several sets are last
+    assert (np.bincount(own, minlength=sets.count)[: sets.count] > 0).all() and own.max() == (
+        sets.count > 1
+    ) * sets.count
+    np.testing.assert_array_equal(ray_map.pixel, pixel[np.lexsort((first, own))])
+    for number in range(sets.count):
+        one = ray_map.of(number)
+        np.testing.assert_array_equal(np.sort(ray_map.pixel[one.start : one.end]), pixel[own == number])
+    ends = np.cumsum(np.bincount(own, minlength=sets.count)[: sets.count]).tolist()
+    assert [(one.start, one.end) for one in ray_map.of_sets] == list(zip([0, *ends], ends, strict=False))
+    assert (ray_map.of(ALL).start, ray_map.of(ALL).end) == (0, len(pixel))
     counts = np.diff(found.first.numpy())
     assert found.first.numpy()[0] == 0 and counts.min() > 0
     order = np.lexsort((found.place.numpy(), np.repeat(ray_map.pixel, counts)))
