@@ -236,6 +236,47 @@ def dense(blocks) -> np.ndarray:
     return matrix
 
 
+def separable(weights) -> np.ndarray:
+    """Return `SeparableWeights` as a matrix from voxels (z, y, x in memory) to rays, shape (ray, voxel), float64."""
+    (rows, planes, columns), blocks = weights.shape, weights.blocks
+    strip_rows, parts, block, rim_levels = 16, 2, 16, 400
+    rays = np.zeros((weights.ray_rows, weights.strips, weights.lenses, weights.pixels, strip_rows, rows, planes, columns))
+    rim = weights.rim.reshape(rays.shape[:5]).astype(float) / rim_levels
+    for plane, ray_row, strip in np.ndindex(planes, weights.ray_rows, weights.strips):
+        taps = int(weights.down_taps[plane])
+        size = weights.ray_rows * weights.strips * blocks * strip_rows * taps * block
+        start = weights.down_start[plane]
+        down = weights.down[start : start + size].reshape(weights.ray_rows, weights.strips, blocks, strip_rows, taps, block)
+        line = np.zeros((columns, strip_rows, rows, columns))  # weight of a voxel of the plane on each element of the line
+        for column, lane, tap in np.ndindex(columns, strip_rows, taps):
+            first = int(weights.down_first[plane, ray_row, strip, column // block, lane])
+            if 0 <= first and first + tap < rows:
+                level = float(down[ray_row, strip, column // block, lane, tap, column % block])
+                line[column, lane, first + tap, column] = level * weights.down_scale[plane]
+        lane = np.arange(strip_rows)
+        lens_row = lane // parts - (strip_rows // parts - 1) / 2
+        row = ray_row + 0.5 - weights.middle[strip * strip_rows + lane]
+        along = (weights.turn[plane, strip, 0] * lens_row + weights.turn[plane, strip, 1] * row)[:, None, None]
+        before, behind = np.zeros_like(line), np.zeros_like(line)
+        before[1:], behind[:-1] = line[:-1], line[1:]
+        line = along * (along + 1) / 2 * before + (1 - along**2) * line + along * (along - 1) / 2 * behind
+        count, taps = int(weights.lens_count[plane, strip]), int(weights.taps[plane, strip])
+        first = weights.first[weights.first_start[plane, strip] :][: count * weights.pixels]
+        level = weights.level[weights.level_start[plane, strip] :][: count * weights.pixels * taps * parts]
+        level = level.reshape(count, weights.pixels, taps, parts).astype(float)
+        for lens, pixel, tap in np.ndindex(count, weights.pixels, taps):
+            column = int(first.reshape(count, -1)[lens, pixel]) + tap
+            if column < columns:
+                value = level[lens, pixel, tap, lane % parts][:, None, None]
+                at = ray_row, strip, weights.lens[plane, strip] + lens, pixel
+                rays[at][:, :, plane] += value * line[column]
+    behind, before = np.zeros_like(rays), np.zeros_like(rays)
+    behind[:, :, :, :-1], before[:, :, :, 1:] = rays[:, :, :, 1:], rays[:, :, :, :-1]
+    rays = rays + rim[..., None, None, None] * (behind - before)
+    order = [5 + weights.axes.index(axis) for axis in range(3)]
+    return rays.transpose(0, 1, 2, 3, 4, *order).reshape(weights.rim.size, -1)
+
+
 def smart(matrix, image, volume, *, iterations, relaxation=1.0, floor=0.0, paper=False):
     """Return SMART's volume with a dense matrix (pixel, voxel): Eq. 5 normalised by column, or as printed (`paper`)."""
     column_sum = matrix.sum(0)

@@ -34,9 +34,12 @@ from lfpiv.weights.choice import Choice, choose_form, choose_uncounted
 from lfpiv.weights.counting import CountedVoxels
 from lfpiv.weights.depth_planes import NodeGrid, choose_planes, line_of_sight
 from lfpiv.weights.operator import Weights, build_weights
+from lfpiv.weights.separable import Planes, are_possible, choose_separable, ray_sets
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
+from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -57,6 +60,8 @@ THIN_VOXELS = 120_000
 """Reconstructed voxels of a slab one voxel thick, with its guard layers, above which its slices are cut."""
 LEAST_EDGE = 8
 """Least edge of a slice [voxel of the experiment]."""
+CHECKED_VOXELS = 200_000
+"""Voxels of a part in which the accuracy of shared profiles is measured."""
 CUBE_EDGE = 10
 """Largest edge of the part that loads the kernels [voxel of the experiment]."""
 SEED = 18
@@ -67,15 +72,15 @@ class Form:
     """How the weights of one camera are stored for the whole volume."""
 
     choice: Choice
-    distance: int | None
+    separable: bool = False
+    """Whether planes of voxels share profiles."""
+    distance: int | None = None
     """Layers from one plane of nodes to the next; None where the weights of all voxels are stored."""
-    lines: tuple[bool, bool]
+    lines: tuple[bool, bool] = (False, False)
     """Whether voxels are shared among lines of sight before, along rows and along columns."""
-    size: int
-    """Number of voxels, or of nodes."""
     stored_bytes: int
-    """Memory of the stored blocks [byte]."""
-    device_bytes: int
+    """Memory of the stored weights [byte]."""
+    device_bytes: int = 0
     """Memory of the same on a GPU [byte]."""
 
 
@@ -152,32 +157,55 @@ class Volume:
     def forms(self) -> dict[str, Form]:
         """Choose how the weights of each camera are stored, as `build_weights` does, and count them in a sample."""
         stored = StoredGrid.for_cameras(self.finest.grid, self.cameras.values())
-        compute, found = self.experiment.compute, {}
+        if self.experiment.compute.weights == "count":
+            counted = Choice(form="pixels")
+            return {name: self._blocks_form(stored, camera, counted, None) for name, camera in self.cameras.items()}
+        wanted, choices = self.experiment.compute.weights_form, {}
         for name, camera in self.cameras.items():
-            if compute.weights == "count":
-                choice, nodes = Choice(form="pixels"), None
-            else:
-                square = compute.weights_form == "auto" and camera.lattice.layout == "square"
-                counted = CountedVoxels(stored, camera) if square else None
-                choice = (
-                    choose_uncounted(stored, camera, compute.weights_form) if counted is None else choose_form(counted)
-                )
-                nodes = choose_planes(stored, camera, choice.form, choice.cuts, particle_voxel=self.particle_voxel)
-            places = nodes or stored
-            blocks, values = sample_blocks(PackedCamera.of(camera), places, choice.form, choice.cuts)
-            require_numbers(blocks * places.size, self.finest.grid.shape)
-            size = int(places.size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES))
-            distance, lines = (None, (False, False)) if nodes is None else (nodes.distance, nodes.lines)
-            counts = int(places.size * blocks), int(places.size * values)
-            found[name] = Form(
-                choice=choice,
-                distance=distance,
-                lines=lines,
-                size=places.size,
-                stored_bytes=size,
-                device_bytes=device_bytes(choice.form, places.size, *counts, edge=camera.microimages.edge),
+            square = wanted == "auto" and camera.lattice.layout == "square"
+            choices[name] = (
+                choose_form(CountedVoxels(stored, camera)) if square else choose_uncounted(stored, camera, wanted)
             )
-        return found
+        if all(choice.form == "profiles" for choice in choices.values()) and self._shares_profiles():
+            across = StoredGrid.for_cameras(self.finest.grid, self.cameras.values(), columns_inmost=True)
+            return {
+                name: Form(choice=choices[name], separable=True, stored_bytes=Planes(across, camera).stored_bytes)
+                for name, camera in self.cameras.items()
+            }
+        return {
+            name: self._blocks_form(
+                stored,
+                camera,
+                choices[name],
+                choose_planes(
+                    stored, camera, choices[name].form, choices[name].cuts, particle_voxel=self.particle_voxel
+                ),
+            )
+            for name, camera in self.cameras.items()
+        }
+
+    def _shares_profiles(self) -> bool:
+        """Return whether planes of voxels share profiles, as `build_weights` finds out. Their accuracy is that of a part."""
+        grid, cameras = self.finest.grid, self.cameras
+        if not are_possible(StoredGrid.for_cameras(grid, cameras.values()), cameras):
+            return False
+        part = StoredGrid.for_cameras(self.part(CHECKED_VOXELS).finest.grid, cameras.values(), columns_inmost=True)
+        return choose_separable(part, cameras, math.inf, _ignore) is not None
+
+    def _blocks_form(self, stored: StoredGrid, camera: CalibratedCamera, choice: Choice, nodes: NodeGrid | None) -> Form:
+        """Return how the weights of a camera's voxels, or nodes, are stored in blocks."""
+        places = nodes or stored
+        blocks, values = sample_blocks(PackedCamera.of(camera), places, choice.form, choice.cuts)
+        require_numbers(blocks * places.size, self.finest.grid.shape)
+        distance, lines = (None, (False, False)) if nodes is None else (nodes.distance, nodes.lines)
+        counts = int(places.size * blocks), int(places.size * values)
+        return Form(
+            choice=choice,
+            distance=distance,
+            lines=lines,
+            stored_bytes=int(places.size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)),
+            device_bytes=device_bytes(choice.form, places.size, *counts, edge=camera.microimages.edge),
+        )
 
     def weights(self, forms: Mapping[str, Form]) -> Weights:
         """Build the weights of these voxels in the forms that the whole volume has, and their sums."""
@@ -185,9 +213,16 @@ class Volume:
         if self.experiment.compute.weights == "count":
             built = build_weights(self.calibration, grid, "count")
         else:
-            stored, projectors = StoredGrid.for_cameras(grid, self.cameras.values()), {}
+            separable = all(form.separable for form in forms.values())
+            stored = StoredGrid.for_cameras(grid, self.cameras.values(), columns_inmost=separable)
+            projectors: dict[str, RayProjector] = {}
             for name, camera in self.cameras.items():
                 form = forms[name]
+                if separable:
+                    profiles = Planes(stored, camera).weights(_ignore)
+                    assert profiles is not None  # those of the whole volume were possible
+                    projectors[name] = SeparableProjector(profiles, ray_sets(self.cameras))
+                    continue
                 nodes = None
                 if form.distance is not None:
                     nodes = NodeGrid.of(stored, camera, form.distance, lines=form.lines)

@@ -403,7 +403,11 @@ def build_weights(
         else:
             choices[name] = choose_uncounted(stored, camera, form)
     if planes and choices and all(choice.form == "profiles" for choice in choices.values()):
-        projectors.update(choose_separable(stored, cameras, limit_bytes, whole) or {})
+        columns_inmost = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
+        separable = choose_separable(columns_inmost, cameras, limit_bytes, whole)
+        if separable is not None:
+            stored = columns_inmost
+            projectors.update(separable)
     for number, (name, camera) in enumerate(cameras.items()):
         if name in projectors:
             continue

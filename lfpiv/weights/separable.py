@@ -47,6 +47,9 @@ FEWEST_SETS = 4
 """Rows of pixels across a microimage from which on they are taken in sets."""
 FEWEST_VOXELS = 20_000
 """Voxels of a volume from which on planes share profiles."""
+FAR_ENOUGH = 0.4
+"""Least movement of an image by a voxel of the innermost axis, as a part of the largest one, with which columns lie along
+this axis."""
 SAMPLED_PLANES = 5
 """Planes from which the memory of all planes is estimated."""
 RAY_BYTES = 1 + 8 + 8 + 2 * 8
@@ -152,14 +155,16 @@ def particle_errors(stored: StoredGrid, camera: CalibratedCamera, projector: Sep
 def camera_axes(stored: StoredGrid, camera: CalibratedCamera) -> tuple[int, int, int]:
     """Return the axes in memory that count rows, planes and columns of voxels for a camera.
 
-    Rows follow each other down the sensor, columns across it.
+    Rows follow each other down the sensor, columns across it. Columns lie along the innermost axis in memory where that
+    moves an image far enough.
     """
     middle = (np.array(stored.shape) - 1) / 2
     steps = np.concatenate([middle + 0.5 * np.eye(3), middle - 0.5 * np.eye(3)])
     places = camera.map(stored.positions_mm(steps), np.zeros((6, 2)))
     moved = np.abs(places[:3] - places[3:])
     rows = int(np.argmax(moved[:, 1]))
-    columns = int(np.argmax(np.where(np.arange(3) == rows, -1.0, moved[:, 0])))
+    across = np.where(np.arange(3) == rows, -1.0, moved[:, 0])
+    columns = 2 if across[2] >= FAR_ENOUGH * across.max() else int(np.argmax(across))
     return rows, 3 - rows - columns, columns
 
 
@@ -189,13 +194,17 @@ class Planes:
         return values <= MOST_VALUES and max(self.shape) < limit and all(one is not None for one in self._sampled)
 
     @property
+    def stored_bytes(self) -> int:
+        """Memory of the profiles [byte], about."""
+        return int(self.shape[1] * np.mean([0 if one is None else one.nbytes for one in self._sampled]))
+
+    @property
     def estimated_bytes(self) -> int:
-        """Memory of the weights and their rays [byte], about."""
-        rows, planes, columns = self.shape
-        each = np.mean([0 if one is None else one.nbytes for one in self._sampled])
+        """Memory of the profiles and of the rays [byte], about."""
+        _, planes, columns = self.shape
         profiles = self.profiles
         rays = profiles.ray_rows * self._strips * self._lenses * profiles.pixels * STRIP
-        return int(planes * each + RAY_BYTES * rays + lines_bytes(planes, columns))
+        return self.stored_bytes + RAY_BYTES * rays + lines_bytes(planes, columns)
 
     def weights(self, progress: StepProgress) -> SeparableWeights | None:
         """Integrate the profiles of all planes; None if a pixel sees too many columns of voxels."""

@@ -29,11 +29,13 @@ class StoredGrid:
     """Axes of the grid (0: z, 1: y, 2: x), outermost first."""
 
     @classmethod
-    def for_cameras(cls, grid: Grid, cameras: Iterable[CalibratedCamera]) -> StoredGrid:
+    def for_cameras(
+        cls, grid: Grid, cameras: Iterable[CalibratedCamera], *, columns_inmost: bool = False
+    ) -> StoredGrid:
         """Choose the order by how far 1 mm along each axis moves a point's image.
 
         The axis with the largest movement across the sensors' rows is the outermost one. Of the other two, the one with
-        the larger movement across the columns is the middle one.
+        the larger movement across the columns is the middle one, or the innermost one for `columns_inmost`.
         """
         centre = [
             first + (n - 1) / 2 * grid.voxel_mm for first, n in zip(grid.first_centre_mm, grid.shape, strict=True)
@@ -44,8 +46,8 @@ class StoredGrid:
             st = camera.map(steps, np.zeros((4, 2)))
             shift += np.abs(st[1:] - st[0])
         outer = int(np.argmax(shift[:, 1]))
-        middle, inner = sorted((axis for axis in range(3) if axis != outer), key=lambda axis: -float(shift[axis, 0]))
-        return cls(grid, (outer, middle, inner))
+        far, near = sorted((axis for axis in range(3) if axis != outer), key=lambda axis: -float(shift[axis, 0]))
+        return cls(grid, (outer, near, far) if columns_inmost else (outer, far, near))
 
     @property
     def shape(self) -> tuple[int, int, int]:
