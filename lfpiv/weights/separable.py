@@ -7,6 +7,7 @@ a little. `choose_separable` compares images of particles with those from the vo
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Iterator, Mapping
@@ -33,7 +34,7 @@ from lfpiv.weights.ray_fit import grid_models
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector_separable import MOST_VALUES, SeparableProjector, lines_bytes
-from lfpiv_kernels.reconstruction.separable_weights import PARTS, STRIP, SeparableWeights
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, PARTS, STRIP, SeparableWeights
 from lfpiv_kernels.weights.separable import MOST_TAPS, PlaneProfiles, Profiles
 
 if TYPE_CHECKING:
@@ -50,8 +51,10 @@ FEWEST_VOXELS = 20_000
 FAR_ENOUGH = 0.4
 """Least movement of an image by a voxel of the innermost axis, as a part of the largest one, with which columns lie along
 this axis."""
-SAMPLED_PLANES = 5
+SAMPLED_PLANES = 3
 """Planes from which the memory of all planes is estimated."""
+SAMPLED_EDGE = 32
+"""Rows and columns of the parts of these planes that are looked at: some in the middle, and some in each corner."""
 RAY_BYTES = 1 + 8 + 8 + 2 * 8
 """Memory of a ray [byte]: its rim, pixel and share; its light there and back; its place in the map to pixels, and that
 of the sets."""
@@ -191,12 +194,16 @@ class Planes:
         """Whether the kernels have room for the profiles of a lens, and numbers for its rows and columns."""
         limit = np.iinfo(np.int16).max
         values = self.profiles.pixels * MOST_TAPS * PARTS + STRIP
-        return values <= MOST_VALUES and max(self.shape) < limit and all(one is not None for one in self._sampled)
+        return values <= MOST_VALUES and max(self.shape) < limit and max(self._taps[1]) <= MOST_TAPS
 
     @property
     def stored_bytes(self) -> int:
         """Memory of the profiles [byte], about."""
-        return int(self.shape[1] * np.mean([0 if one is None else one.nbytes for one in self._sampled]))
+        blocks = -(-self.shape[2] // COLUMN_BLOCK)
+        rows = self.profiles.ray_rows * self._strips * blocks * STRIP
+        pixels = self._strips * self._lenses * self.profiles.pixels
+        down, across = (float(np.mean(taps)) for taps in self._taps)
+        return int(self.shape[1] * (rows * (2 + COLUMN_BLOCK * down) + pixels * (2 + PARTS * across)))
 
     @property
     def estimated_bytes(self) -> int:
@@ -208,12 +215,12 @@ class Planes:
 
     def weights(self, progress: StepProgress) -> SeparableWeights | None:
         """Integrate the profiles of all planes; None if a pixel sees too many columns of voxels."""
-        planes = self.shape[1]
+        rows, planes, columns = self.shape
         found: list[PlaneProfiles] = []
         turns = np.empty((planes, self._strips, 2), np.float32)
         with threadpool_limits(1, "blas"):
-            for plane, model in enumerate(self._models(0, planes)):
-                one, turns[plane] = self._profiles_of(model)
+            for plane, model in enumerate(self._models((0, 0, 0), (planes, rows, columns))):
+                one, turns[plane] = self._profiles_of(model, (rows, columns))
                 if one is None:
                     return None
                 found.append(one)
@@ -237,29 +244,38 @@ class Planes:
         )
 
     @cached_property
-    def _sampled(self) -> list[PlaneProfiles | None]:
-        """Profiles of some planes."""
-        planes = np.unique(np.linspace(0, self.shape[1] - 1, SAMPLED_PLANES).round().astype(int))
-        return [self._profiles_of(next(self._models(int(plane), 1)))[0] for plane in planes]
+    def _taps(self) -> tuple[list[int], list[int]]:
+        """Largest numbers of rows of voxels in a profile down, and of columns in one across, of some planes."""
+        rows, planes, columns = self.shape
+        edges = min(rows, SAMPLED_EDGE), min(columns, SAMPLED_EDGE)
+        corners = [(rows - edges[0]) * part for part in (0, 1)], [(columns - edges[1]) * part for part in (0, 1)]
+        middle = (rows - edges[0]) // 2, (columns - edges[1]) // 2
+        down, across = [], []
+        for plane in np.unique(np.linspace(0, planes - 1, SAMPLED_PLANES).round().astype(int)).tolist():
+            found = [
+                self._profiles_of(next(self._models((plane, *first), (1, *edges))), edges)[0]
+                for first in {middle, *itertools.product(*corners)}
+            ]
+            down.append(max(one.down_taps if one else 0 for one in found))
+            across.append(max(int(one.lens[:, 2].max()) if one else MOST_TAPS + 1 for one in found))
+        return down, across
 
-    def _models(self, first: int, count: int) -> Iterator[np.ndarray]:
-        """Yield the ray models of some planes, row by row."""
+    def _models(self, first: tuple[int, int, int], count: tuple[int, int, int]) -> Iterator[np.ndarray]:
+        """Yield the ray models of some voxels (plane, row, column), plane by plane."""
 
         def positions_mm(steps: np.ndarray) -> np.ndarray:
             """Return places [mm] by indices (plane, row, column)."""
             along = np.empty(np.shape(steps))
-            along[:, self.axes[1]], along[:, self.axes[0]], along[:, self.axes[2]] = steps.T
-            along[:, self.axes[1]] += first
+            along[:, self.axes[1]], along[:, self.axes[0]], along[:, self.axes[2]] = (steps + first).T
             return self.stored.positions_mm(along)
 
-        rows, _, columns = self.shape
         order = (self.axes[1], self.axes[0], self.axes[2])
         planes, down, across = (2 - self.stored.order[axis] for axis in order)
-        return grid_models(self.camera, (count, rows, columns), positions_mm, (planes, down, across))
+        return grid_models(self.camera, count, positions_mm, (planes, down, across))
 
-    def _profiles_of(self, model: np.ndarray) -> tuple[PlaneProfiles | None, np.ndarray]:
-        """Return the profiles of a plane, and its turns (strip, 2), from the ray models of its voxels."""
-        rows, _, columns = self.shape
+    def _profiles_of(self, model: np.ndarray, shape: tuple[int, int]) -> tuple[PlaneProfiles | None, np.ndarray]:
+        """Return the profiles of a plane of rows and columns, and its turns (strip, 2), from its voxels' ray models."""
+        rows, columns = shape
         part_rows = STRIP // PARTS
         middle_rows = self._first_lens[1] + part_rows * np.arange(PARTS * self._strips) + (part_rows - 1) / 2
         seen, turn = _seen_by_parts(self.camera, model.reshape(rows, columns, -1), middle_rows)

@@ -18,8 +18,10 @@ namespace lfpiv {
 constexpr float LARGEST_LEAP = 50.0f;
 /// Least light of an active voxel under momentum: smaller float32 numbers are slow, and a zero would stay zero.
 constexpr float SMALLEST = 1.17549435e-38f;
-/// Largest absolute power of 2 by which light is multiplied: light below 1e30 vanishes before.
-constexpr float LARGEST_POWER = 250.0f;
+/// Largest absolute exponent of momentum.
+constexpr float LARGEST_MOMENTUM = 20.0f;
+/// Largest absolute x for which `exponential` gives e^x.
+constexpr float LARGEST_EXPONENT = 86.0f;
 
 /// A float and its bits.
 union Bits {
@@ -27,11 +29,17 @@ union Bits {
     int bits;
 };
 
-/// Return 2^whole, for -126 <= whole <= 127.
-LFPIV_INLINE float power_of_2(int whole) {
-    Bits power;
-    power.bits = (int)((unsigned)(whole + 127) << 23);
-    return power.value;
+/// Return 2^whole * e^rest for |whole| <= 125 and |rest| <= log(2) / 2; relative error 1e-7 and roundings.
+LFPIV_INLINE float power(int whole, float rest) {
+    LFPIV_FUSED
+    float series = 8.3125010e-3f * rest + 4.1890330e-2f;  // the least largest error
+    series = series * rest + 1.6667116e-1f;
+    series = series * rest + 4.9999230e-1f;
+    series = series * rest + 1.0f;
+    series = series * rest + 1.0f;
+    Bits scale;
+    scale.bits = (int)((unsigned)(whole + 127) << 23);
+    return series * scale.value;
 }
 
 /// The integer next to a number, absolute value below 2^22.
@@ -40,7 +48,6 @@ struct Nearest {
     float value;
 
     LFPIV_INLINE explicit Nearest(float x) {
-    LFPIV_FUSED
         constexpr float SHIFT = 12582912.0f;  // 1.5 * 2^23: the sum has no bits for a fraction
         Bits sum, shift;
         shift.value = SHIFT, sum.value = x + SHIFT;
@@ -49,31 +56,36 @@ struct Nearest {
     }
 };
 
-/// Return light * 2^whole * e^rest for |whole| <= `LARGEST_POWER`, |rest| <= log(2) / 2; relative error 2e-7. Zeros
-/// stay zero, and the result is not infinite or subnormal before the last product.
-LFPIV_INLINE float times_power(float light, int whole, float rest) {
-    LFPIV_FUSED
-    float series = 1.3888889e-3f * rest + 8.3333333e-3f;  // Taylor series of e^rest
-    series = series * rest + 4.1666667e-2f;
-    series = series * rest + 1.6666667e-1f;
-    series = series * rest + 0.5f;
-    series = series * rest + 1.0f;
-    series = series * rest + 1.0f;
-    const int first = min(max(whole, -125), 127);
-    return light * (series * power_of_2(first)) * power_of_2(whole - first);
+/// e^x as 2^whole * e^rest.
+struct Exponent {
+    int whole;
+    float rest;
+
+    LFPIV_INLINE explicit Exponent(float x) {
+        LFPIV_FUSED
+        const Nearest nearest(1.4426950f * x);
+        whole = nearest.whole;
+        rest = (x - nearest.value * 0.693359375f) + nearest.value * 2.1219444e-4f;  // log(2) in two parts
+    }
+};
+
+/// Return e^x for |x| <= `LARGEST_EXPONENT`.
+LFPIV_INLINE float exponential(float x) {
+    const Exponent exponent(x);
+    return power(exponent.whole, exponent.rest);
 }
 
-/// Return light * e^x. Beyond |x| = 173 the power no longer changes.
-LFPIV_INLINE float times_exp(float light, float x) {
-    LFPIV_FUSED
-    constexpr float LARGEST = LARGEST_POWER * 0.6931472f;
-    x = -LARGEST > x ? -LARGEST : x < LARGEST ? x : LARGEST;
-    const Nearest power(1.4426950f * x);
-    const float rest = (x - power.value * 0.693359375f) + power.value * 2.12194440e-4f;  // log(2) in two parts
-    return times_power(light, power.whole, rest);
+/// Return light * e^x for light below 1e30. An x beyond twice `LARGEST_EXPONENT` counts as that: light vanishes there.
+/// Zeros stay zero, and no power is infinite.
+LFPIV_INLINE float times_exponential(float light, float x) {
+    constexpr float LARGEST = 2 * LARGEST_EXPONENT;
+    x = x < -LARGEST ? -LARGEST : x > LARGEST ? LARGEST : x;  // NaN stays
+    const Exponent exponent(x);
+    const int first = min(max(exponent.whole, -125), 125);
+    return light * power(first, exponent.rest) * power(min(max(exponent.whole - first, -125), 125), 0.0f);
 }
 
-/// Return log2(x) for a normal number x > 0; error 1e-7 and a rounding.
+/// Return log2(x) for a normal number x > 0; error 4e-8 and roundings.
 LFPIV_INLINE float log2_of(float x) {
     LFPIV_FUSED
     Bits mantissa;
@@ -81,16 +93,15 @@ LFPIV_INLINE float log2_of(float x) {
     const int whole = (mantissa.bits - 0x3f3504f3) >> 23;
     mantissa.bits -= whole << 23;
     const float t = (mantissa.value - 1.0f) / (mantissa.value + 1.0f), t2 = t * t;  // 2 artanh(t) / log(2)
-    return (float)whole + t * (2.8853901f + t2 * (0.9617967f + t2 * (0.5770780f + t2 * 0.4121986f)));
+    return (float)whole + t * (2.8853912f + t2 * (0.96147080f + t2 * 0.59897390f));
 }
 
 /// Return light * (light / last)^exponent, at least `SMALLEST`; zeros of `last` stay zero.
 LFPIV_INLINE float extrapolated(float light, float last, float exponent) {
-    LFPIV_FUSED
     const float ratio = min(max(light / last, 1.0f / LARGEST_LEAP), LARGEST_LEAP);
-    const float power = min(max(exponent * log2_of(ratio), -LARGEST_POWER), LARGEST_POWER);
-    const Nearest nearest(power);
-    const float ahead = times_power(light, nearest.whole, (power - nearest.value) * 0.6931472f);
+    const float logarithm = exponent * log2_of(ratio);
+    const Nearest nearest(logarithm);
+    const float ahead = light * power(nearest.whole, 0.69314718f * (logarithm - nearest.value));
     return last > 0.0f ? max(ahead, SMALLEST) : last;
 }
 
@@ -99,11 +110,12 @@ LFPIV_INLINE float extrapolated(float light, float last, float exponent) {
 template <class Light>
 LFPIV_INLINE void store_steps(int run, int size, const float* last, float momentum, float* stepped, float* ahead,
                               Light light) {
+    const float exponent = min(max(momentum, -LARGEST_MOMENTUM), LARGEST_MOMENTUM);
     if (last)
         for_voxels(run, size, [=](int k) {
             const float before = last[k], own = light(k);
             const float lifted = before > 0.0f ? max(own, SMALLEST) : own;
-            const float beyond = extrapolated(lifted, before, momentum);
+            const float beyond = extrapolated(lifted, before, exponent);
             stepped[k] = lifted;
             ahead[k] = beyond;
         });
@@ -116,10 +128,10 @@ LFPIV_INLINE void update(int run, int size, const float* volume, const float* ex
                          const float* over, const float* last, float momentum, float* stepped, float* ahead) {
     if (over)
         store_steps(run, size, last, momentum, stepped, ahead,
-                    [=](int k) { return times_exp(volume[k], step[k] * (exponent[k] * length * over[k])); });
+                    [=](int k) { return times_exponential(volume[k], step[k] * (exponent[k] * length * over[k])); });
     else
         store_steps(run, size, last, momentum, stepped, ahead,
-                    [=](int k) { return times_exp(volume[k], step[k] * (exponent[k] * length)); });
+                    [=](int k) { return times_exponential(volume[k], step[k] * (exponent[k] * length)); });
 }
 
 /// Step by volume * exp(logarithm + share * (logarithm - blurred)), the absolute exponent at most `largest`. `over` is
@@ -127,9 +139,10 @@ LFPIV_INLINE void update(int run, int size, const float* volume, const float* ex
 LFPIV_INLINE void sharpen(int run, int size, const float* volume, const float* logarithm, const float* blurred,
                           float share, float largest, const float* over, const float* last, float momentum,
                           float* stepped, float* ahead) {
+    const float most = min(largest, LARGEST_EXPONENT);
     const auto light = [=](int k, float smooth) {
         const float step = logarithm[k] + share * (logarithm[k] - smooth);
-        return times_exp(volume[k], min(max(step, -largest), largest));
+        return volume[k] * exponential(min(max(step, -most), most));
     };
     if (over)
         store_steps(run, size, last, momentum, stepped, ahead, [=](int k) { return light(k, blurred[k] * over[k]); });

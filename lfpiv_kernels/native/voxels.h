@@ -18,7 +18,7 @@ LFPIV_INLINE void for_voxels(int run, int size, Body body) {
     if (run < size) body(run);
 #else
     const int begin = run * VOXELS_OF_RUN, end = size - begin < VOXELS_OF_RUN ? size : begin + VOXELS_OF_RUN;
-#pragma clang loop vectorize(assume_safety)
+#pragma clang loop vectorize(assume_safety) vectorize_width(WIDTH)
     for (int voxel = begin; voxel < end; ++voxel) body(voxel);
 #endif
 }
@@ -67,20 +67,23 @@ LFPIV_INLINE void part(int run, int size, float least, float* light, float* acti
 /// Return the sum of weight * value^2, float32, from `begin` to `end`, `step` apart, in float64. Add the values to
 /// `added` if it is not null.
 LFPIV_INLINE double sum_squares(const float* weight, const float* values, int begin, int end, int step, float* added) {
-    double sum[LANES] = {};
-    int first = begin;
+    double sum = 0.0;
+    int k = begin;
 #if !LFPIV_GPU
-    for (; step == 1 && first + LANES <= end; first += LANES)
-        for (int lane = 0; lane < LANES; ++lane) {
-            const float value = values[first + lane];
-            sum[lane] += (double)(weight[first + lane] * value * value);
-        }
+    typedef double Doubles __attribute__((vector_size(8 * LANES)));
+    Doubles sums = {};
+    for (; step == 1 && k + LANES <= end; k += LANES) {
+        const Floats<LANES> value = load<LANES>(values + k);
+        sums += __builtin_convertvector(load<LANES>(weight + k) * value * value, Doubles);
+        if (added) store(added + k, load<LANES>(added + k) + value);
+    }
+    for (int lane = 0; lane < LANES; ++lane) sum += sums[lane];
 #endif
-    for (int k = first; k < end; k += step) sum[0] += (double)(weight[k] * values[k] * values[k]);
-    if (added)
-        for (int k = begin; k < end; k += step) added[k] += values[k];
-    for (int lane = 1; lane < LANES; ++lane) sum[0] += sum[lane];
-    return sum[0];
+    for (; k < end; k += step) {
+        sum += (double)(weight[k] * values[k] * values[k]);
+        if (added) added[k] += values[k];
+    }
+    return sum;
 }
 
 }  // namespace lfpiv

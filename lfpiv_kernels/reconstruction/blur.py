@@ -23,17 +23,22 @@ FEWEST_VOXELS = 8192
 
 
 @wp.func_native("""
-    const int64_t area = (int64_t)middle.first.shape[0] * inner.first.shape[0];
-    lfpiv::blur_plane(lfpiv::axis_blur(outer), lfpiv::axis_blur(middle), lfpiv::axis_blur(inner), plane, volume.data,
-                      work_out.data + plane * area, blurred_out.data + plane * area);
+    const lfpiv::AxisBlur along = lfpiv::axis_blur(middle);
+    const int64_t area = (int64_t)along.size * length;
+    const lfpiv::RowBlur inner{row.data, (int)row.shape[0], nearest};
+    lfpiv::blur_plane(lfpiv::axis_blur(outer), along, inner, length, plane, volume.data,
+                      work_out.data + (int64_t)slot * work_out.shape[1], blurred_out.data + plane * area);
 """)
-def _blur_one(
+def _blur_plane(
     outer: Axis,
     middle: Axis,
-    inner: Axis,
+    row: wp.array(dtype=float),
+    nearest: bool,
+    length: int,
     plane: int,
+    slot: int,
     volume: wp.array(dtype=float),
-    work_out: wp.array(dtype=float),
+    work_out: wp.array2d(dtype=float),
     blurred_out: wp.array(dtype=float),
 ): ...
 
@@ -43,14 +48,17 @@ def _blur(
     # in
     outer: Axis,
     middle: Axis,
-    inner: Axis,
+    row: wp.array(dtype=float),  # weights along the innermost axis
+    nearest: bool,
+    length: int,  # of a row
     volume: wp.array(dtype=float),
+    slot: int,
     first_plane: int,
     # out
-    work_out: wp.array(dtype=float),
+    work_out: wp.array2d(dtype=float),
     blurred_out: wp.array(dtype=float),
 ):
-    _blur_one(outer, middle, inner, first_plane + wp.tid(), volume, work_out, blurred_out)
+    _blur_plane(outer, middle, row, nearest, length, first_plane + wp.tid(), slot, volume, work_out, blurred_out)
 
 
 class GaussianBlur:
@@ -79,16 +87,22 @@ class GaussianBlur:
         radius = int(truncate * sigma_voxel + 0.5)
         offset = np.arange(-radius, radius + 1)
         profile = np.exp(-(offset**2) / (2 * sigma_voxel**2))
+        profile /= profile.sum()
         self.shape = shape
-        self._axes = [_axis(profile / profile.sum(), size, border) for size in shape]
+        self._axes = [_axis(profile, size, border) for size in shape]
+        self._row, self._nearest = profile.astype(np.float32), border == "nearest"
 
     def __call__(self, volume: Given) -> Given:
         """Return the blurred volume, on the device if `volume` is; both float32, C-contiguous, shape (voxel,)."""
-        source, work, blurred = to_device(volume, float), empty(volume.size), empty(volume.size)
+        source, blurred = to_device(volume, float), empty(volume.size)
         if runtime.device().form == "gpu":
-            blur_gpu.blur(self._axes, source, work, blurred)
+            blur_gpu.blur(self._axes, source, empty(volume.size), blurred)
         else:
-            call = Call(_blur, self.shape[0], [*self._axes, source], [work, blurred])
+            (outer, middle, _), (planes, rows, length) = self._axes, self.shape
+            memory = rows * length + length + self._row.size - 1  # a plane, and a row continued beyond its ends
+            work = empty(runtime.CHUNKS * memory).reshape((runtime.CHUNKS, memory))
+            inputs = [outer, middle, to_device(self._row, float), self._nearest, length, source]
+            call = Call(_blur, planes, inputs, [work, blurred], scratch=True)
             launch(call, parts=parts_of(volume.size, FEWEST_VOXELS))
         return as_given(blurred, volume)
 

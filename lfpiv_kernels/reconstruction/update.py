@@ -18,6 +18,10 @@ wp.set_module_options(native.options("update.h"))
 
 FEWEST_RUNS = 256
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
+LARGEST_MOMENTUM: float = native.constant("steps.h", "LARGEST_MOMENTUM")
+"""Largest absolute exponent of momentum; beyond it the exponent counts as this one."""
+LARGEST_EXPONENT: float = native.constant("steps.h", "LARGEST_EXPONENT")
+"""Largest absolute logarithm by which a sharpened step changes a voxel, whatever limit it is given."""
 LARGEST_LEAP: float = native.constant("steps.h", "LARGEST_LEAP")
 """Largest ratio of two iterates that momentum repeats, and the inverse of the smallest one."""
 SMALLEST: float = native.constant("steps.h", "SMALLEST")
@@ -143,9 +147,7 @@ def _sharpen(
     ahead_out: wp.array(dtype=float),
 ):
     run = first_run + wp.tid()
-    _sharpen_run(
-        run, size, volume, logarithm, blurred, share, largest, over, last, momentum, stepped_out, ahead_out
-    )
+    _sharpen_run(run, size, volume, logarithm, blurred, share, largest, over, last, momentum, stepped_out, ahead_out)
 
 
 @wp.func_native("lfpiv::extrapolate(run, size, last.data, exponent, volume_out.data, ahead_out.data);")
@@ -196,6 +198,7 @@ class Leap:
     last: wp.array
     """Volume after the step before, shape (voxel,), float32."""
     exponent: float
+    """At most `LARGEST_MOMENTUM`."""
     ahead: wp.array
     """Where to write; it may be the memory of `last` or of what the step starts from."""
 
@@ -310,7 +313,7 @@ def sharpen(
 ) -> None:
     """Write volume * exp(logarithm + share * (logarithm - over * blurred)) to `stepped`; float32, shape (voxel,).
 
-    The absolute exponent is at most `largest`. The other arguments are as of `update`.
+    The absolute exponent is at most `largest`, and at most `LARGEST_EXPONENT`. The other arguments are as of `update`.
     """
     last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
     inputs = [volume, logarithm, blurred, float(share), float(largest), over, last, float(momentum)]

@@ -12,6 +12,7 @@ from lfpiv_kernels.transfer import duplicate, empty, to_device, to_host, zeros
 
 TOLERANCE_SUM = 1e-12  # float64 sums of the same terms in another order, relative
 TOLERANCE_F32 = 1e-6  # a few roundings of float32, relative
+TOLERANCE_POWER = 1e-6  # a power as a polynomial in float32, relative; of momentum times its exponent, at least 1
 TOLERANCE_GUESS = 2e-4  # exp(x) - 1 from x = 1e-3 on, where the difference loses three of seven digits, relative
 SIZES = [1, 7, 1025, 20_011]
 
@@ -127,6 +128,93 @@ def test_steps_with_momentum_equal_their_twin(volumes, over, momentum, in_place)
             ratio = np.divide(expected, last, out=np.ones_like(expected), where=last > 0)
             ahead = expected * np.clip(ratio, 1 / update.LARGEST_LEAP, update.LARGEST_LEAP) ** beta
             np.testing.assert_allclose(to_host(leap.ahead), np.where(last > 0, ahead, 0), rtol=20 * TOLERANCE_F32)
+
+
+FLOAT32 = np.finfo(np.float32)
+LIGHT = np.float32([0, FLOAT32.tiny, 1e-30, 1e-3, 1, 70_000, 1e29])
+"""Light of which powers are tried: all that counts can be."""
+
+
+def assert_light(found, expected, tolerance=TOLERANCE_POWER):
+    """Compare float32 with its twin in float64, beyond the range of float32 as well.
+
+    Where a library made the processor take subnormal numbers for zeros, they are.
+    """
+    found = to_host(found)
+    inside = np.abs(expected) < (1 - tolerance) * FLOAT32.max
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=tolerance, atol=FLOAT32.tiny)
+    assert (found[~inside] >= (1 - 2 * tolerance) * FLOAT32.max).all() and not np.isnan(found).any()
+
+
+@pytest.mark.parametrize("momentum", [False, True])
+def test_light_times_exponentials_of_all_sizes(momentum):
+    ends = [-np.inf, -1e30, -1e4, -172, 172, 1e4, 1e30, np.inf]
+    exponent = np.float32([*np.linspace(-170, 170, 4001), *np.linspace(-1, 1, 4000), *ends])
+    light, exponent = (part.ravel() for part in np.meshgrid(LIGHT, exponent))
+    limit = 2 * update.LARGEST_EXPONENT
+    expected = light * np.exp(np.clip(exponent.astype(float), -limit, limit))
+    stepped, volume = empty(light.size), to_device(light)
+    leap = update.Leap(volume, 0.0, empty(light.size)) if momentum else None
+    update.update(volume, to_device(exponent), voxels.ones(light.size), leap=leap, stepped=stepped)
+    least = FLOAT32.tiny if momentum else 0
+    assert_light(stepped, np.where(light > 0, np.maximum(expected, least), 0))
+    assert (to_host(stepped)[light > 0] >= least).all() and not to_host(stepped)[light == 0].any()
+
+
+def test_light_vanishes_where_the_exponent_is_next_to_minus_infinity():
+    light, stepped = np.float32([0, 1, 1e29]), empty(3)
+    update.update(to_device(light), voxels.ones(3), to_device(np.full(3, -1e30, np.float32)), stepped=stepped)
+    assert not to_host(stepped).any()
+
+
+def test_an_exponent_that_is_not_a_number_shows_in_the_light():
+    light, stepped = np.ones(20, np.float32), empty(20)
+    update.update(to_device(light), voxels.ones(20), to_device(np.full(20, np.nan, np.float32)), stepped=stepped)
+    assert np.isnan(to_host(stepped)).all()
+
+
+@pytest.mark.parametrize("largest", [3.0, 86.0, 1e30])
+def test_sharpened_steps_are_limited(largest):
+    logarithm = np.float32([*np.linspace(-100, 100, 4001), -1e30, 1e30, np.nan])
+    light, logarithm = (part.ravel() for part in np.meshgrid(LIGHT, logarithm))
+    limit, stepped, dark = min(largest, update.LARGEST_EXPONENT), empty(light.size), zeros(light.size)
+    expected = light * np.exp(np.fmin(np.fmax(logarithm.astype(float), -limit), limit))
+    update.sharpen(to_device(light), to_device(logarithm), dark, 0.0, largest, stepped=stepped)
+    assert_light(stepped, expected)
+    assert not to_host(stepped)[light == 0].any()
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.3, 0.94, 1.0, -2.5, 20.0, -20.0, 300.0])
+def test_momentum_of_all_ratios(exponent):
+    assert np.float32(update.SMALLEST) == FLOAT32.tiny
+    ratio = np.float32([*np.geomspace(0.019, 51, 4001), 0, 1e-37, 1e-4, 1, 1e4, 1e38])
+    last, ratio = (part.ravel() for part in np.meshgrid(np.float32([*LIGHT, -1, np.inf]), ratio))
+    with np.errstate(all="ignore"):
+        light = np.nan_to_num(last * ratio, nan=0, posinf=np.inf)
+        lifted = np.where(last > 0, np.maximum(light, FLOAT32.tiny), light)
+        repeated = np.divide(lifted, last, out=np.ones_like(light), where=last > 0).astype(float)
+        repeated = np.fmin(np.fmax(repeated, 1 / update.LARGEST_LEAP), update.LARGEST_LEAP)
+        power = repeated ** np.clip(exponent, -update.LARGEST_MOMENTUM, update.LARGEST_MOMENTUM)
+        expected = np.where(last > 0, np.maximum(lifted * power, FLOAT32.tiny), last)
+    volume, leap = to_device(light.copy()), update.Leap(to_device(last), exponent, empty(last.size))
+    update.extrapolate(volume, leap)
+    np.testing.assert_array_equal(to_host(volume), lifted)
+    assert_light(leap.ahead, expected, TOLERANCE_POWER * max(1, min(abs(exponent), update.LARGEST_MOMENTUM)))
+    np.testing.assert_array_equal(to_host(leap.ahead)[last <= 0], last[last <= 0])
+    assert (to_host(leap.ahead)[last > 0] >= FLOAT32.tiny).all()
+
+
+def test_subnormal_light_is_lifted_or_taken_for_zero():
+    """By a step with momentum; which of them, processors decide."""
+    light = np.arange(1, 2**23, 9973, dtype=np.uint32).view(np.float32)
+    light = np.concatenate([light, light, np.float32(np.linspace(0, 1e-30, 100))])
+    for beta in (0.0, 0.5, 0.94):
+        volume, memory = to_device(light.copy()), to_device(light[::-1].copy())
+        stepped, leap = empty(light.size), update.Leap(memory, beta, empty(light.size))
+        signed = to_device(np.float32(np.linspace(-3, 3, light.size)))
+        update.sharpen(volume, signed, zeros(light.size), 0.5, 3.0, leap=leap, stepped=stepped)
+        for found in (to_host(stepped), to_host(leap.ahead)):
+            assert ((found >= 0) & (found < 1e-27)).all()
 
 
 def test_the_first_guess_equals_its_twin(volumes):
