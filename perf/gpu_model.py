@@ -16,6 +16,7 @@ import json
 import traceback
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import gpu_correlation
 import numpy as np
@@ -32,6 +33,7 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, State
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep
+from lfpiv.weights import separable
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
@@ -140,7 +142,8 @@ class Model:
         if refinement != 1.0:
             edge = voxels.voxel_mm / refinement
             voxels = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.1 * of["voxels"],) * 3, voxel_mm=edge)
-        weights = lfpiv.build_weights(rig(of["sensor"]), voxels, form=form)
+        with patch.object(separable, "are_possible", lambda *_: False):  # as on a GPU
+            weights = lfpiv.build_weights(rig(of["sensor"]), voxels, form=form)
         first, *others = map(weights.projector, weights.cameras)
         with loops_for_a_gpu():
             projector = Projector(first.blocks, first.planes)

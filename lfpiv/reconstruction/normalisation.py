@@ -142,16 +142,15 @@ class Normalisation:
 
     def _joint_partition(self) -> Partition:
         """Return the subsets of all cameras. All have the same step, of another length each."""
-        count, light = len(self._subsets), np.zeros(len(self._subsets))
-        for number, name in enumerate(self._weights.cameras):
-            of_sets = self._camera_gains[number] * self._weights.light_of_sets(name)
-            light += [of_sets[ray_set] for subset in self._subsets for camera, ray_set in subset.parts if camera == number]
-        lengths = tuple((count / np.maximum(count * light / light.sum(), 1)).tolist())
-        size = self._quotient(np.float32(self._settings.relaxation), self._column_sum, self._seen)
-        plain = (SmartStep(size, self.sieve),) * count
+        derived, key = self._weights.derived, ("lengths of joint subsets", len(self._subsets))
+        if key not in derived:
+            derived[key] = joint_lengths(self._weights, self._subsets)
+        lengths, excess = derived[key]
+        size = self._quotient(np.float32(self._settings.relaxation), self._column_sum * excess, self._seen)
+        plain = (SmartStep(size, self.sieve),) * len(self._subsets)
         if self.sieve.sigma_voxel == 0:
             return Partition(self._subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
-        sharpened = (SharpenedStep(size, self.sieve),) * count
+        sharpened = (SharpenedStep(size, self.sieve),) * len(self._subsets)
         return Partition(self._subsets, sharpened, plain, lengths, JOINT_CONFLICT)
 
     def _partition(self, subsets: tuple[Subset, ...], conflict: float) -> Partition:
@@ -170,10 +169,47 @@ class Normalisation:
         names = list(self._weights.cameras)
         total: np.ndarray = sum(
             self._camera_gains[camera]
-            * (self._weights.camera_sums[camera] if part == ALL else self._weights.sums_of_set(names[camera], part))
+            * (self._weights.camera_sums[camera] if part == ALL else self._kept_sums(names[camera], part))
             for camera, part in subset.parts
         )
         return total
 
+    def _kept_sums(self, name: str, ray_set: int) -> np.ndarray:
+        """Return the sums of one set of rays, which later instants need, too."""
+        derived, key = self._weights.derived, ("sums of a set", name, ray_set)
+        if key not in derived:
+            derived[key] = self._weights.sums_of_set(name, ray_set)
+        sums: np.ndarray = derived[key]
+        return sums
+
     def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
         return to_device(np.divide(numerator, denominator, out=np.zeros_like(self._column_sum), where=where), float)
+
+
+def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[float, ...], np.ndarray]:
+    """Return how long the steps of subsets of all cameras are, so that none is longer than 1 / max(s_n, s / N).
+
+    With the share r_n of subset n in the light of all, its step is a_n / (s q), a_n = N / max(N r_n, 1), where q is the
+    largest quotient max(N s_n / s, 1) / max(N r_n, 1) of all subsets. It is little more than 1 for most voxels. Sums of
+    all cameras are nowhere a larger part than those of one of them, so brightnesses of cameras do not matter.
+
+    Returns
+    -------
+    lengths : tuple of float
+        a_n of each subset.
+    excess : ndarray, shape (voxel,), float32
+        q of each voxel.
+    """
+    names, count = list(weights.cameras), len(subsets)
+    light = np.zeros(count)
+    for number, subset in enumerate(subsets):
+        light[number] = sum(weights.light_of_sets(names[camera])[ray_set] for camera, ray_set in subset.parts)
+    least = np.maximum(count * light / light.sum(), 1)
+    excess = np.ones(weights.grid.size, np.float32)
+    for subset, own in zip(subsets, least, strict=True):
+        for camera, name in enumerate(names):
+            sums: np.ndarray = sum(weights.sums_of_set(name, ray_set) for of, ray_set in subset.parts if of == camera)
+            of_all = weights.camera_sums[camera]
+            share = np.divide(count * sums, of_all, out=np.zeros_like(sums), where=of_all > 0)
+            np.maximum(excess, share / np.float32(own), out=excess)
+    return tuple((count / least).tolist()), excess

@@ -93,7 +93,6 @@ class Weights(Shown):
         self._choices = dict(choices or {})
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
-        self._set_sums: dict[tuple[str, int], np.ndarray] = {}
         self._set_light: dict[str, np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
@@ -234,14 +233,11 @@ class Weights(Shown):
         ndarray, shape (voxel,), float32
             In stored order.
         """
-        if (name, ray_set) not in self._set_sums:
-            projector, gain = self.projector(name), self.gain(name)
-            pixels = projector.see_only(ray_set)
-            image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
-            image[pixels] = gain[pixels]
-            projector.back_project(image, sums, ray_set)
-            self._set_sums[name, ray_set] = sums
-        return self._set_sums[name, ray_set]
+        projector, gain = self.projector(name), self.gain(name)
+        pixels = projector.see_only(ray_set)
+        image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
+        image[pixels] = gain[pixels]
+        return projector.back_project(image, sums, ray_set)
 
     def light_of_sets(self, name: str) -> np.ndarray:
         """Return the light of an evenly lit volume in the pixels of a camera that see one set of rays only.

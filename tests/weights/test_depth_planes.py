@@ -10,7 +10,7 @@ from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, 
 import lfpiv
 from lfpiv.reconstruction.resting_voxels import RestingVoxels
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
-from lfpiv.weights import depth_planes
+from lfpiv.weights import depth_planes, separable
 from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.depth_planes import (
     PARTICLE_ERROR,
@@ -43,6 +43,14 @@ CAMERAS = {
 }
 BETWEEN = {"30": rotation(30), "-60, rolled": rotation(-60, 0.5, 3), "35 and 20": rotation(35, 20)}
 """Cameras whose line of sight follows no lattice direction."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_shared_profiles():
+    """Do not let planes share profiles, which would serve these rigs, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(separable, "FEWEST_VOXELS", np.inf)
+        yield
 
 
 @pytest.fixture
@@ -292,7 +300,8 @@ def test_volumes_are_as_good_as_with_the_weights_of_all_voxels(weights, request)
     assert alike[0] > alike[1] - 0.01
 
 
-def test_memory_with_nodes_is_estimated():
+def test_memory_with_nodes_is_estimated(monkeypatch):
+    monkeypatch.setattr(separable, "are_possible", lambda *_: False)  # they would be stored in place of nodes
     rig = two_cameras(optics=optics(rows=60, columns=80))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.4, 2.4, 2.4), voxel_mm=0.05)
     nothing = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=0.05, first_centre_mm=(0.0, 50.0, 0.0))

@@ -1,0 +1,177 @@
+"""Weights as profiles that planes of voxels share: when they are used, and how near they are to voxels' footprints."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
+
+import lfpiv
+from lfpiv.weights import separable
+from lfpiv.weights.checks import compare_with_count, estimate_memory
+from lfpiv.weights.depth_planes import PARTICLE_ERROR, WORST_PARTICLE_ERROR, Sample, blobs_about
+from lfpiv.weights.separable import choose_separable, particle_errors, ray_sets
+from lfpiv.weights.storage import open_weights, save_weights
+from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+
+TOLERANCE_SUMS = 0.02
+"""Sums of the weights of voxels that are wholly seen, as a part: profiles have 8 bits and are the same for a plane."""
+TOLERANCE_ESTIMATE = 0.15
+"""Memory: taps are those of some voxels, and lenses are taken for seen by every plane."""
+GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.5, 1.4), voxel_mm=0.05)
+
+
+def rig_of(*cameras):
+    return IdealRig({camera.name: camera for camera in cameras})
+
+
+def camera(name="one", yaw_deg=45.0, roll_deg=0.0, layout="square"):
+    return IdealCamera(name, rotation(yaw_deg, 0.2), optics(260, 280, layout), lattice(layout, roll_deg))
+
+
+@pytest.fixture(scope="module")
+def both(device):
+    """Return the weights of two cameras by shared profiles and by those of all voxels."""
+    rig = rig_of(camera("one", 40, 0.05), camera("two", -48, -0.08))
+    return lfpiv.build_weights(rig, GRID), lfpiv.build_weights(rig, GRID, planes=False)
+
+
+def test_profiles_are_shared_where_rows_of_lenses_are_level(both):
+    shared, every = both
+    assert shared.has_ray_rows and not every.has_ray_rows
+    assert shared.forms == every.forms == {"one": "profiles", "two": "profiles"}
+    assert shared.memory_bytes < 0.7 * every.memory_bytes
+
+
+@pytest.mark.parametrize(
+    "cameras",
+    [
+        (camera("upright"), camera("turned", -45, 3.0)),
+        (camera("hexagonal", layout="hexagonal"),),
+    ],
+    ids=["one array turned", "hexagonal"],
+)
+def test_profiles_are_not_shared_where_one_camera_does_not_suit(cameras, device):
+    rig = rig_of(*cameras)
+    assert not lfpiv.build_weights(rig, GRID).has_ray_rows
+    stored = StoredGrid.for_cameras(GRID, rig.cameras.values(), columns_inmost=True)
+    assert choose_separable(stored, rig.cameras, np.inf, lambda part: None) is None
+
+
+def test_profiles_are_not_shared_beyond_the_memory_that_is_left(both):
+    cameras = both[0].cameras
+    stored = StoredGrid.for_cameras(GRID, cameras.values(), columns_inmost=True)
+    assert choose_separable(stored, cameras, 1e6, lambda part: None) is None
+
+
+def test_small_volumes_store_all_voxels(device):
+    grid = lfpiv.Grid(shape=(20, 20, 20), voxel_mm=0.05, first_centre_mm=(-0.5, -0.5, -0.5))
+    assert not lfpiv.build_weights(rig_of(camera()), grid).has_ray_rows
+
+
+def test_images_of_other_particles_are_those_of_footprints(both):
+    shared, every = both
+    stored, rng = shared.stored, np.random.default_rng(10)
+    voxels, light = blobs_about(stored, rng.choice(stored.size, 12))
+    for name in shared.cameras:
+        errors = []
+        for at, bright in zip(voxels, light, strict=True):
+            volume = np.zeros(stored.size, np.float32)
+            np.add.at(volume, at, bright.astype(np.float32))
+            volume = stored.restore(volume)
+            found, expected = shared.of_camera(name)(volume)[name], every.of_camera(name)(volume)[name]
+            errors.append(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+        assert np.sqrt(np.mean(np.square(errors))) < PARTICLE_ERROR / 2 and max(errors) < WORST_PARTICLE_ERROR / 2
+
+
+def test_errors_of_particles_are_those_of_a_plain_comparison(both):
+    shared, every = both
+    name, stored = "two", shared.stored
+    errors = particle_errors(stored, shared.cameras[name], shared.projector(name))
+    seen = np.unique(np.concatenate([separable.draw_seen(stored, shared.cameras[name], seed) for seed in separable.SEEDS]))
+    voxels, light = blobs_about(stored, seen[:: len(seen) // separable.PARTICLES + 1])
+    sample = Sample(shared.cameras[name], voxels, light, "profiles")
+    assert len(errors) == len(voxels) == sum(one.shape[0] for one in sample.own_images(stored))
+    volume = np.zeros(stored.size, np.float32)
+    np.add.at(volume, voxels[0], light[0].astype(np.float32))
+    volume = stored.restore(volume)
+    gain = shared.cameras[name].gain
+    found, expected = (one.of_camera(name)(volume)[name] / gain for one in both)
+    assert errors[0] == pytest.approx(np.linalg.norm(found - expected) / np.linalg.norm(expected), rel=0.02)
+
+
+def test_sums_of_weights_are_those_of_footprints(both):
+    shared, every = both
+    for of_planes, of_voxels in zip(shared.camera_sums, every.camera_sums, strict=True):
+        of_planes, of_voxels = shared.stored.restore(of_planes), every.stored.restore(of_voxels)
+        wholly = of_voxels > 0.9 * of_voxels.max()
+        assert wholly.mean() > 0.9
+        np.testing.assert_allclose(of_planes[wholly], of_voxels[wholly], rtol=TOLERANCE_SUMS)
+    assert shared.largest == pytest.approx(every.largest, rel=0.02)
+    lit = every.affected_pixels
+    some = lit > 0
+    assert np.abs(shared.affected_pixels[some] / lit[some] - 1).mean() < 0.03
+
+
+def test_operator_is_adjoint(both):
+    shared, rng = both[0], np.random.default_rng(2)
+    volume = rng.random(GRID.shape).astype(np.float32)
+    images = {name: rng.random(one.optics.sensor_shape).astype(np.float32) for name, one in shared.cameras.items()}
+    there = sum((shared(volume)[name].astype(float) * images[name]).sum() for name in images)
+    assert there == pytest.approx((shared.T(images).astype(float) * volume).sum(), rel=1e-5)
+
+
+def test_rows_of_pixels_see_all_of_the_light_once(both):
+    shared = both[0]
+    for name in shared.cameras:
+        projector = shared.projector(name)
+        assert projector.ray_sets == ray_sets(shared.cameras)
+        alone = [projector.see_only(number) for number in range(projector.ray_sets)]
+        pixels = np.concatenate(alone)
+        assert len(np.unique(pixels)) == len(pixels) > 0.9 * len(projector.map.pixel)
+        light = shared.light_of_sets(name)
+        assert light.min() > 0.1 * light.mean()
+        image = projector.project(np.ones(GRID.size, np.float32), np.zeros(shared.gain(name).size, np.float32))
+        assert light.sum() == pytest.approx((image * shared.gain(name))[pixels].sum(), rel=1e-5)
+
+
+def test_stored_weights_are_opened_as_they_were(both, tmp_path):
+    shared = both[0]
+    content = save_weights(shared, tmp_path / "weights")
+    opened = open_weights(tmp_path / "weights", shared.cameras, content)
+    volume = np.random.default_rng(3).random(GRID.shape).astype(np.float32)
+    assert opened.has_ray_rows and opened.stored == shared.stored
+    for name, image in shared(volume).items():
+        assert isinstance(opened.projector(name), SeparableProjector)
+        np.testing.assert_array_equal(opened(volume)[name], image)
+
+
+def test_memory_is_estimated(both):
+    shared = both[0]
+    rays = sum(8 * one.rays.size + one.weights.pixel.nbytes for one in map(shared.projector, shared.cameras))
+    estimate = estimate_memory(rig_of(*shared.cameras.values()), GRID)
+    planes = [separable.Planes(shared.stored, one) for one in shared.cameras.values()]
+    assert sum(one.stored_bytes for one in planes) == pytest.approx(shared.memory_bytes, rel=TOLERANCE_ESTIMATE)
+    assert estimate > shared.memory_bytes + rays
+
+
+def test_counted_rays_are_compared_with_the_voxels_own_footprints(both):
+    shared, every = both
+    expected = compare_with_count(every)
+    for name, errors in compare_with_count(shared).items():
+        assert np.mean(errors) == pytest.approx(np.mean(expected[name]), rel=0.5)  # of other voxels
+
+
+def test_particles_are_found_by_subsets_of_rows_as_well_as_by_those_of_lenses(both):
+    shared, every = both
+    rng, truth = np.random.default_rng(4), np.zeros(GRID.shape, np.float32)
+    for z, y, x in rng.integers(4, np.array(GRID.shape) - 4, (60, 3)):
+        truth[z, y, x] += rng.uniform(50, 100)
+    truth = ndimage.gaussian_filter(truth, 0.9, mode="constant")
+    alike = []
+    for weights in both:
+        images = every(truth)
+        volume = lfpiv.reconstruct(weights, images, floor=0.01, sieve_voxel=0.7)
+        alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
+    assert alike[0] > alike[1] - 0.01 and alike[0] > 0.9
+
