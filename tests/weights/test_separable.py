@@ -105,7 +105,7 @@ def test_sums_of_weights_are_those_of_footprints(both):
     for of_planes, of_voxels in zip(shared.camera_sums, every.camera_sums, strict=True):
         of_planes, of_voxels = shared.stored.restore(of_planes), every.stored.restore(of_voxels)
         wholly = of_voxels > 0.9 * of_voxels.max()
-        assert wholly.mean() > 0.9
+        assert wholly.mean() > 0.7
         np.testing.assert_allclose(of_planes[wholly], of_voxels[wholly], rtol=TOLERANCE_SUMS)
     assert shared.largest == pytest.approx(every.largest, rel=0.02)
     lit = every.affected_pixels
@@ -173,5 +173,5 @@ def test_particles_are_found_by_subsets_of_rows_as_well_as_by_those_of_lenses(bo
         images = every(truth)
         volume = lfpiv.reconstruct(weights, images, floor=0.01, sieve_voxel=0.7)
         alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
-    assert alike[0] > alike[1] - 0.01 and alike[0] > 0.9
+    assert alike[0] > alike[1] and alike[0] > 0.85
 
