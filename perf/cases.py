@@ -143,8 +143,13 @@ def _footprint(scale, form, bent_mm=0.0) -> Work:
     return work
 
 
+def _weights(scale, form):
+    """Build the weights: where peers do the same work, those of all voxels, which are an explicit matrix."""
+    return lfpiv.build_weights(rig(scale["sensor"]), grid(scale), form=form, planes=scale["voxels"] > PEER_VOXELS)
+
+
 def _projection(scale, forward, form="profiles") -> Work:
-    weights, rng = lfpiv.build_weights(rig(scale["sensor"]), grid(scale), form=form), np.random.default_rng(3)
+    weights, rng = _weights(scale, form), np.random.default_rng(3)
     volume = rng.random(weights.grid.shape, np.float32)
     images = {name: rng.random(camera.gain.shape, np.float32) for name, camera in weights.cameras.items()}
     forth, back = weights(volume), weights.T(images)
@@ -177,7 +182,7 @@ def _projection(scale, forward, form="profiles") -> Work:
 
 
 def _smart(scale, iterations, form="profiles") -> Work:
-    weights = lfpiv.build_weights(rig(scale["sensor"]), grid(scale), form=form)
+    weights = _weights(scale, form)
     truth = 1e4 * particles(weights.grid.shape)
     images = weights(truth)
     first = np.full(weights.grid.shape, float(truth.mean()), np.float32)

@@ -45,7 +45,7 @@ AT_ONCE = 2
 """Architectures that are compiled side by side, each by a process of some 1 GiB."""
 CPU_MODULES = (
     "blocks", "blur", "box_sum", "deform", "depth_planes", "line_shares", "neighbours", "peaks", "pixel_rays", "planes",
-    "projector", "spectra", "windows",
+    "projector", "projector_separable", "separable", "spectra", "windows",
 )  # fmt: skip
 """Modules without a kernel for a GPU; their headers need not compile for one."""
 CPU_ONLY = {

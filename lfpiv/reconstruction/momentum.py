@@ -42,7 +42,7 @@ class Momentum:
 
     def forget(self, coefficients: DeviceArray, active: DeviceArray) -> None:
         """Forget the voxels where `active` is 0: their `coefficients` will not change by the momentum."""
-        replace_resting(self.previous, coefficients, active)
+        replace_resting(self.previous, active, coefficients)
 
     def leap(self, ahead: DeviceArray) -> Leap:
         """Return what a step needs to extrapolate its coefficients into `ahead`."""

@@ -138,7 +138,8 @@ class Normalisation:
         cameras = len(self._weights.cameras)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
         in_turn = (self._subsets, subsets_of(cameras)) if may_grow else (self._subsets,)
-        return tuple(self._partition(subsets, CONFLICT if may_grow else 0.0) for subsets in in_turn)
+        last = in_turn[-1]
+        return tuple(self._partition(subsets, 0.0 if subsets is last else CONFLICT) for subsets in in_turn)
 
     def _joint_partition(self) -> Partition:
         """Return the subsets of all cameras. All have the same step, of another length each."""

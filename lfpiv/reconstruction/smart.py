@@ -16,9 +16,11 @@ import numpy as np
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.steps import Step
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
+from lfpiv_kernels.reconstruction.voxels import replace_resting
 from lfpiv_kernels.transfer import DeviceArray, zeros
 
 
@@ -77,9 +79,9 @@ class ImageEquations:
     def back_project(self, volume: DeviceArray) -> DeviceArray:
         """Back-project the logarithms that `compare` left: sum_i w log((I + b) / (P + b)); 0 where `volume` is 0."""
         exponent = zeros(volume.size)
-        for camera in self.cameras:
-            camera.projector.gather(exponent, active=volume)
-        return exponent
+        for number in range(len(self.cameras)):
+            self._gather(number, ALL, volume, exponent)
+        return self._without_dark(exponent, volume)
 
     def hold(self, volume: DeviceArray) -> None:
         """Add the projections of a volume to those of each volume that is compared from now on, until `release`."""
@@ -107,7 +109,18 @@ class ImageEquations:
         exponent = zeros(volume.size)
         for camera, ray_set in parts:
             self.compare_part(camera, ray_set, volume)
-            self.cameras[camera].projector.gather(exponent, active=volume, ray_set=ray_set)
+            self._gather(camera, ray_set, volume, exponent)
+        return self._without_dark(exponent, volume)
+
+    def _gather(self, camera: int, ray_set: int, volume: DeviceArray, exponent: DeviceArray) -> None:
+        """Add what the rays of one camera hold to an exponent; at least where `volume` is not 0."""
+        projector = self.cameras[camera].projector
+        projector.gather(exponent, active=None if projector.takes_rows else volume, ray_set=ray_set)
+
+    def _without_dark(self, exponent: DeviceArray, volume: DeviceArray) -> DeviceArray:
+        """Return an exponent that is 0 where `volume` is 0."""
+        if any(camera.projector.takes_rows for camera in self.cameras):
+            replace_resting(exponent, volume)
         return exponent
 
     def measured(self) -> Misfit:

@@ -152,7 +152,7 @@ LFPIV_INLINE void gather_voxel(const Matrix& matrix, int voxel, int lenses, cons
 template <class Matrix>
 LFPIV_INLINE void count_voxel(const Matrix& matrix, int voxel, const float* share, int* count_out) {
     int begin, end;
-    blocks_under(matrix, voxel, 2, begin, end);
+    blocks_under(matrix, voxel, -1, begin, end);
     const float count = sum_blocks(matrix, begin, end, [&](float level, int ray) {
         return level > 0.0f && ray >= 0 && share[ray] > 0.0f ? 1.0f : 0.0f;
     });

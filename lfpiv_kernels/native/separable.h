@@ -1,9 +1,9 @@
 // A camera's weights as products of profiles that whole planes of voxels share, against the light of its rays. For the
 // CPU; a GPU has ``separable_gpu.h``.
 //
-// A ray row is one row of pixels under every lens: rays[row][strip][lens][pixel column][lens row of the strip]. The light
-// of a plane as a ray row sees it, column by column, is its line: line[column][lens row]. Profiles down lead from the
-// voxels of a column to its line, profiles across from lines to rays.
+// A ray row is one row of pixels under every lens: rays[row][strip][lens][pixel column][lens row of the strip]. The
+// light of a plane as a ray row sees it, column by column, is its line: line[column][lens row]. Profiles down lead from
+// the voxels of a column to its line, profiles across from lines to rays.
 #ifndef LFPIV_SEPARABLE_H
 #define LFPIV_SEPARABLE_H
 
@@ -13,7 +13,8 @@ namespace lfpiv {
 
 /// Rows of lenses side by side: lanes of a line.
 constexpr int STRIP = 16;
-/// Parts of a strip, each of neighbouring rows of lenses with profiles across of its own. Their rows take turns as lanes.
+/// Parts of a strip, each of neighbouring rows of lenses with profiles across of its own. Their rows take turns as
+/// lanes.
 constexpr int PARTS = 2;
 /// Columns of a plane side by side, whose profiles down begin at the same row of voxels.
 constexpr int COLUMN_BLOCK = 16;
@@ -125,7 +126,8 @@ struct Down {
     }
 };
 
-/// How lines are moved along their columns, a lane each: a line at column k becomes the sum of those at k - 1, k, k + 1.
+/// How lines are moved along their columns, a lane each: a line at column k becomes the sum of those at k - 1, k, k
+/// + 1.
 struct Turn {
     Lane before, here, behind;
     bool none;
@@ -146,31 +148,27 @@ struct Turn {
 };
 
 /// Swap parts of `WIDE` lanes between vectors that lie `WIDE` apart: one stage of `transpose`.
-#define LFPIV_SWAP(WIDE, ...)                                     \
-    for (int n = 0; n < STRIP; ++n) {                             \
-        if (n & WIDE) continue;                                   \
-        const Lane one = square[n], other = square[n + WIDE];     \
+#define LFPIV_SWAP(WIDE, ...)                                 \
+    for (int n = 0; n < STRIP; ++n) {                         \
+        if (n & WIDE) continue;                               \
+        const Lane one = square[n], other = square[n + WIDE]; \
         square[n] = __builtin_shufflevector(one, other, __VA_ARGS__);
 
 /// Turn a square of vectors: lane k of vector n becomes lane n of vector k.
 LFPIV_INLINE void transpose(Lane* square) {
     static_assert(STRIP == 16, "lanes below");
     LFPIV_SWAP(8, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23)
-        square[n + 8] =
-            __builtin_shufflevector(one, other, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
-    }
-    LFPIV_SWAP(4, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27)
-        square[n + 4] =
-            __builtin_shufflevector(one, other, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
-    }
-    LFPIV_SWAP(2, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
-        square[n + 2] =
-            __builtin_shufflevector(one, other, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
-    }
-    LFPIV_SWAP(1, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30)
-        square[n + 1] =
-            __builtin_shufflevector(one, other, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
-    }
+    square[n + 8] = __builtin_shufflevector(one, other, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+}
+LFPIV_SWAP(4, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27)
+square[n + 4] = __builtin_shufflevector(one, other, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+}
+LFPIV_SWAP(2, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29)
+square[n + 2] = __builtin_shufflevector(one, other, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+}
+LFPIV_SWAP(1, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30)
+square[n + 1] = __builtin_shufflevector(one, other, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+}
 }
 #undef LFPIV_SWAP
 
@@ -183,9 +181,7 @@ LFPIV_INLINE Lane load_voxels(const float* from, int count) {
 }
 
 /// Return the floats of a line with its margins.
-LFPIV_INLINE int line_size(const SeparableArrays& in) {
-    return (in.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP;
-}
+LFPIV_INLINE int line_size(const SeparableArrays& in) { return (in.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP; }
 
 /// Columns of a plane, whole blocks of them.
 struct ColumnBlocks {
@@ -230,8 +226,7 @@ LFPIV_INLINE void sum_up(const SeparableArrays& in, const float* line, int plane
         const short* const first = down.first + block * STRIP;
         const unsigned char* level = down.level + (int64_t)block * STRIP * down.taps * COLUMN_BLOCK;
         Lane square[COLUMN_BLOCK];
-        for (int k = 0; k < COLUMN_BLOCK; ++k)
-            square[k] = load<STRIP>(line + (column + k) * STRIP) * down.scale;
+        for (int k = 0; k < COLUMN_BLOCK; ++k) square[k] = load<STRIP>(line + (column + k) * STRIP) * down.scale;
         transpose(square);
         for (int k = 0; k < STRIP; ++k, level += down.taps * COLUMN_BLOCK) {
             if (first[k] < 0) continue;
@@ -332,8 +327,8 @@ LFPIV_INLINE void gather_across(const float* rays, const short* first, const flo
 template <class Work>
 LFPIV_INLINE void with_taps(int taps, Work work) {
     switch (taps) {
-#define LFPIV_CASE(N)       \
-    case N:                 \
+#define LFPIV_CASE(N)          \
+    case N:                    \
         work.template of<N>(); \
         break;
         LFPIV_CASE(1)
@@ -435,8 +430,8 @@ LFPIV_INLINE void turn_back_rim(const SeparableArrays& in, int64_t lens, const f
     }
 }
 
-/// Add the weighted sum of the light of a ray row to the voxels of one plane. `rays` are those of this ray row, with the
-/// rim turned back; `line` is memory of one line.
+/// Add the weighted sum of the light of a ray row to the voxels of one plane. `rays` are those of this ray row, with
+/// the rim turned back; `line` is memory of one line.
 LFPIV_INLINE void gather_plane(const SeparableArrays& in, const float* rays, int ray_row, int plane, float* line,
                                float* volume_out) {
     const int64_t lens_rays = (int64_t)in.pixels * STRIP;

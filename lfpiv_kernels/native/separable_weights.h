@@ -1,4 +1,5 @@
-// The profiles of `separable.h` from the ray models of voxels: of one plane at a time, integrated as in ``footprint.h``.
+// The profiles of `separable.h` from the ray models of voxels: of one plane at a time, integrated as in
+// ``footprint.h``.
 #ifndef LFPIV_SEPARABLE_WEIGHTS_H
 #define LFPIV_SEPARABLE_WEIGHTS_H
 
@@ -111,7 +112,8 @@ struct PlaneOfVoxels {
     int rows, columns, blocks;
 
     LFPIV_INLINE int64_t place(const RayLayout& rays, int ray_row, int lens_row, int block) const {
-        return ((int64_t)ray_row * rays.strips + lens_row / STRIP) * blocks * STRIP + block * STRIP + RayLayout::lane_of(lens_row);
+        return ((int64_t)ray_row * rays.strips + lens_row / STRIP) * blocks * STRIP + block * STRIP +
+               RayLayout::lane_of(lens_row);
     }
 };
 
@@ -155,15 +157,15 @@ LFPIV_INLINE void fill_down(const RayLayout& rays, const PlaneOfVoxels& plane, i
                     const float level = value * per_level + 0.5f;
                     if (level < 1.0f) return;
                     const int64_t at = plane.place(rays, ray_row, j, block);
-                    level_out[(at * taps + (row - first[at])) * COLUMN_BLOCK + c] =
-                        (unsigned char)min(level, LEVELS);
+                    level_out[(at * taps + (row - first[at])) * COLUMN_BLOCK + c] = (unsigned char)min(level, LEVELS);
                 });
         }
 }
 
-/// Find the profiles across of the columns of a plane for one strip, whose ray models lie on the middle row of lenses of
-/// each part. Write the first lens and the number of lenses, the number of taps, then `first` of each lens and pixel,
-/// which must hold -1, and the values, `MOST_TAPS` to a pixel and part. Return whether there is room for all taps.
+/// Find the profiles across of the columns of a plane for one strip, whose ray models lie on the middle row of lenses
+/// of each part. Write the first lens and the number of lenses, the number of taps, then `first` of each lens and
+/// pixel, which must hold -1, and the values, `MOST_TAPS` to a pixel and part. Return whether there is room for all
+/// taps.
 LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, float least, int* lens_out,
                               short* first_out, float* value_out) {
     const Geometry& g = *rays.in.geometry;
@@ -171,8 +173,7 @@ LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, flo
     bool room = true;
     for (int at_column = 0; at_column < columns * PARTS; ++at_column) {
         const int column = at_column / PARTS, part = at_column % PARTS;
-        const float j =
-            (float)(rays.in.first_j + strip * STRIP + part * (STRIP / PARTS)) + 0.5f * (STRIP / PARTS - 1);
+        const float j = (float)(rays.in.first_j + strip * STRIP + part * (STRIP / PARTS)) + 0.5f * (STRIP / PARTS - 1);
         const Voxel voxel(rays.in, (strip * PARTS + part) * columns + column);
         const ReachedLenses reached(voxel);
         if (reached.count == 0) continue;
@@ -181,8 +182,7 @@ LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, flo
             float centre_s, centre_t, s, t, k[4];
             rays.lens_at((float)i, j, centre_s, centre_t);
             const float middle = rays.middle(centre_s, g.half_columns), radius = g.radius / voxel.pupil_pixel;
-            const float back =
-                abs(reached.slope[0]) < 1e-6f ? 0.0f : (centre_s - voxel.model.s[0]) / reached.slope[0];
+            const float back = abs(reached.slope[0]) < 1e-6f ? 0.0f : (centre_s - voxel.model.s[0]) / reached.slope[0];
             const float u = min(max(back, -g.radius), g.radius);
             voxel.slope(u, 0.0f, k);
             const LocalFrame<float> local(voxel, u, 0.0f, k);
@@ -232,7 +232,8 @@ LFPIV_INLINE void write_ray_row(const RayLayout& rays, int ray_row, int strip, i
             pixel_out[at] = seen ? row * columns + column : -1;
             share_out[at] = inside;
             const bool cut = inside > 0.0f && inside < 1.0f;
-            // the middle of the part inside lies (1 - inside) / 2 inwards; half of it times a difference over two pixels
+            // the middle of the part inside lies (1 - inside) / 2 inwards; half of it times a difference over two
+            // pixels
             const float rim = cut ? -0.25f * (1.0f - inside) * x / max(away, 1e-3f) : 0.0f;
             rim_out[at] = (signed char)(rim * RIM_LEVELS + (rim < 0.0f ? -0.5f : 0.5f));
         }

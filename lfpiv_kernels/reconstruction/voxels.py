@@ -185,8 +185,8 @@ def add(added: wp.array, out: wp.array, mask: wp.array | None = None) -> None:
     sweep_runs(_add, [added, mask], [out])
 
 
-def replace_resting(out: wp.array, values: wp.array, active: wp.array) -> None:
-    """Overwrite `out` by `values` where `active` is 0."""
+def replace_resting(out: wp.array, active: wp.array, values: wp.array | None = None) -> None:
+    """Overwrite `out` by `values` where `active` is 0. Default: by 0."""
     sweep_runs(_replace, [active, values], [out])
 
 

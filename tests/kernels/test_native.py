@@ -17,6 +17,8 @@ HEADERS = sorted(native.FOLDER.glob("*.h"))
 CPU_ONLY = {  # a GPU has ``neighbours_gpu`` and ``projector_gpu`` instead
     "lfpiv_kernels.correlation.neighbours",
     "lfpiv_kernels.reconstruction.projector",
+    "lfpiv_kernels.reconstruction.projector_separable",
+    "lfpiv_kernels.weights.separable",
 }
 CHECKOUT = Path(__file__).resolve().parents[2] / "lfpiv_kernels" / "native"  # the format's file is not installed
 

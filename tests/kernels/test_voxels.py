@@ -39,9 +39,10 @@ def test_sweeps_are_the_operators_of_numpy(volumes):
         total = duplicate(on[0])
         voxels.add(on[3], total, mask)
         np.testing.assert_array_equal(to_host(total), expected)
-    replaced = duplicate(on[0])
-    voxels.replace_resting(replaced, on[3], on[2])
-    np.testing.assert_array_equal(to_host(replaced), np.where(lit > 0, positive, signed))
+    for values, expected in ((on[3], signed), (None, 0)):
+        replaced = duplicate(on[0])
+        voxels.replace_resting(replaced, on[2], values)
+        np.testing.assert_array_equal(to_host(replaced), np.where(lit > 0, positive, expected))
 
 
 def test_a_sweep_may_overwrite_what_it_reads(volumes):

@@ -28,10 +28,10 @@ CASES = {
     "the paper's steps": {"subsets": 1, "sieve_voxel": 0.0, "accelerate": False, "normalisation": "paper"},
     "active share": {"subsets": 4, "active_share": 1e-3},
 }
-VOLUMES = {1: 10, 4: 9.5}
+VOLUMES = {1: 10, 4: 10.5}
 """Volumes that a reconstruction may allocate at once, by the number of subsets; the constants of the rig are older.
 
-Subsets: one of them is the coefficients before an epoch, to which it can be undone.
+Subsets: one of them is the coefficients before an epoch, to which it can be undone, and one the sum of its exponents.
 """
 
 

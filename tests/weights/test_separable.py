@@ -88,7 +88,9 @@ def test_errors_of_particles_are_those_of_a_plain_comparison(both):
     shared, every = both
     name, stored = "two", shared.stored
     errors = particle_errors(stored, shared.cameras[name], shared.projector(name))
-    seen = np.unique(np.concatenate([separable.draw_seen(stored, shared.cameras[name], seed) for seed in separable.SEEDS]))
+    seen = np.unique(
+        np.concatenate([separable.draw_seen(stored, shared.cameras[name], seed) for seed in separable.SEEDS])
+    )
     voxels, light = blobs_about(stored, seen[:: len(seen) // separable.PARTICLES + 1])
     sample = Sample(shared.cameras[name], voxels, light, "profiles")
     assert len(errors) == len(voxels) == sum(one.shape[0] for one in sample.own_images(stored))
@@ -174,4 +176,3 @@ def test_particles_are_found_by_subsets_of_rows_as_well_as_by_those_of_lenses(bo
         volume = lfpiv.reconstruct(weights, images, floor=0.01, sieve_voxel=0.7)
         alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
     assert alike[0] > alike[1] and alike[0] > 0.85
-
