@@ -25,10 +25,12 @@ class Smart(Table):
     """Table ``[smart]``: settings of the reconstruction (Eq. 5)."""
 
     iterations: Steps = 14
-    """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed."""
+    """Largest number of SMART iterations, passes over all rays; without `subsets` some 40 are needed. Fewer are made
+    where further steps of the subsets would not improve the volume."""
     subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
-    """Number of ordered subsets of the rays: 1 for plain SMART, the number of cameras or twice that; "auto" chooses,
-    and goes on with fewer where the subsets contradict each other."""
+    """Number of ordered subsets of the rays: 1 for plain SMART, or up to the rows of pixels across a microimage, 16 at
+    most; where planes of voxels do not share profiles, the number of cameras or twice that. "auto" takes as many as
+    possible and leaves them where they contradict each other."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0
     """Relaxation mu of Eq. 5; values near 3 diverge."""
     normalisation: Literal["column", "paper"] = "column"
