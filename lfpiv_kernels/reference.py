@@ -240,14 +240,20 @@ def separable(weights) -> np.ndarray:
     """Return `SeparableWeights` as a matrix from voxels (z, y, x in memory) to rays, shape (ray, voxel), float64."""
     (rows, planes, columns), blocks = weights.shape, weights.blocks
     strip_rows, parts, block, rim_levels = 16, 2, 16, 400
-    rays = np.zeros((weights.ray_rows, weights.strips, weights.lenses, weights.pixels, strip_rows, rows, planes, columns))
+    rays = np.zeros(
+        (weights.ray_rows, weights.strips, weights.lenses, weights.pixels, strip_rows, rows, planes, columns)
+    )
     rim = weights.rim.reshape(rays.shape[:5]).astype(float) / rim_levels
     for plane, ray_row, strip in np.ndindex(planes, weights.ray_rows, weights.strips):
         taps = int(weights.down_taps[plane])
         size = weights.ray_rows * weights.strips * blocks * strip_rows * taps * block
         start = weights.down_start[plane]
-        down = weights.down[start : start + size].reshape(weights.ray_rows, weights.strips, blocks, strip_rows, taps, block)
-        line = np.zeros((columns, strip_rows, rows, columns))  # weight of a voxel of the plane on each element of the line
+        down = weights.down[start : start + size].reshape(
+            weights.ray_rows, weights.strips, blocks, strip_rows, taps, block
+        )
+        line = np.zeros(
+            (columns, strip_rows, rows, columns)
+        )  # weight of a voxel of the plane on each element of the line
         for column, lane, tap in np.ndindex(columns, strip_rows, taps):
             first = int(weights.down_first[plane, ray_row, strip, column // block, lane])
             if 0 <= first and first + tap < rows:

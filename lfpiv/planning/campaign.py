@@ -242,7 +242,10 @@ def _parts(whole: Volume, forms: Mapping[str, Form], step: StepProgress) -> tupl
     """Measure two parts, after a third one that loads the kernels."""
     counting, dense = whole.experiment.compute.weights == "count", whole.per_voxel()
     large = COUNTED_VOXELS if counting else LARGE_VOXELS
-    rests = all(form.distance is None and not form.separable for form in forms.values()) and whole.finest.grid.size >= FEWEST_VOXELS
+    rests = (
+        all(form.distance is None and not form.separable for form in forms.values())
+        and whole.finest.grid.size >= FEWEST_VOXELS
+    )
     if rests and not counting:  # dark voxels rest in such volumes, so they do in both parts
         sizes = [int(1.1 * FEWEST_VOXELS), 2 * FEWEST_VOXELS]
     else:

@@ -185,14 +185,16 @@ class Volume:
         }
 
     def _shares_profiles(self) -> bool:
-        """Return whether planes of voxels share profiles, as `build_weights` finds out. Their accuracy is that of a part."""
+        """Return whether planes of voxels share profiles, as `build_weights` finds out: here in a part."""
         grid, cameras = self.finest.grid, self.cameras
         if not are_possible(StoredGrid.for_cameras(grid, cameras.values()), cameras):
             return False
         part = StoredGrid.for_cameras(self.part(CHECKED_VOXELS).finest.grid, cameras.values(), columns_inmost=True)
         return choose_separable(part, cameras, math.inf, _ignore) is not None
 
-    def _blocks_form(self, stored: StoredGrid, camera: CalibratedCamera, choice: Choice, nodes: NodeGrid | None) -> Form:
+    def _blocks_form(
+        self, stored: StoredGrid, camera: CalibratedCamera, choice: Choice, nodes: NodeGrid | None
+    ) -> Form:
         """Return how the weights of a camera's voxels, or nodes, are stored in blocks."""
         places = nodes or stored
         blocks, values = sample_blocks(PackedCamera.of(camera), places, choice.form, choice.cuts)

@@ -147,7 +147,7 @@ class Normalisation:
         if key not in derived:
             derived[key] = joint_lengths(self._weights, self._subsets)
         lengths, excess = derived[key]
-        size = self._quotient(np.float32(self._settings.relaxation), self._column_sum * excess, self._seen)
+        size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
         plain = (SmartStep(size, self.sieve),) * len(self._subsets)
         if self.sieve.sigma_voxel == 0:
             return Partition(self._subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
@@ -168,11 +168,10 @@ class Normalisation:
     def _subset_sum(self, subset: Subset) -> np.ndarray:
         """Return the sum of each voxel's weights over the pixels of a subset."""
         names = list(self._weights.cameras)
-        total: np.ndarray = sum(
-            self._camera_gains[camera]
-            * (self._weights.camera_sums[camera] if part == ALL else self._kept_sums(names[camera], part))
-            for camera, part in subset.parts
-        )
+        total = np.zeros_like(self._column_sum)
+        for camera, part in subset.parts:
+            own = self._weights.camera_sums[camera] if part == ALL else self._kept_sums(names[camera], part)
+            total += self._camera_gains[camera] * own
         return total
 
     def _kept_sums(self, name: str, ray_set: int) -> np.ndarray:
@@ -209,7 +208,10 @@ def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[
     excess = np.ones(weights.grid.size, np.float32)
     for subset, own in zip(subsets, least, strict=True):
         for camera, name in enumerate(names):
-            sums: np.ndarray = sum(weights.sums_of_set(name, ray_set) for of, ray_set in subset.parts if of == camera)
+            sums = np.zeros_like(excess)
+            for of, ray_set in subset.parts:
+                if of == camera:
+                    sums += weights.sums_of_set(name, ray_set)
             of_all = weights.camera_sums[camera]
             share = np.divide(count * sums, of_all, out=np.zeros_like(sums), where=of_all > 0)
             np.maximum(excess, share / np.float32(own), out=excess)

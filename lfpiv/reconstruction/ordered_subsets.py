@@ -1,12 +1,12 @@
 """Ordered subsets: SMART steps from a part of the rays each, so that one pass over all rays makes several steps.
 
-A subset is some rows of pixels under every lens, of all cameras at once. Such rows see a part of the pupil each, and all
-of the volume. Where weights are stored in blocks a subset is the rays of one camera through every other lens. Its pixels
-are those that see no other set of rays; a pixel between two of them takes part in whole passes only. The exponent of
-subset n is sum_{i in n} w log((I + b) / (P + b)). Its step is that of `lfpiv.reconstruction.steps` with max(s_n, s / N)
-in place of s, where s_n are the weights' sums over the subset and N is the number of subsets. For rows of pixels s_n is
-nearly the same part of s in all voxels, and that part of the volume's light stands for it. Momentum goes on from subset
-to subset [1]_.
+A subset is some rows of pixels under every lens, of all cameras at once. Such rows see a part of the pupil each, and
+all of the volume. Where weights are stored in blocks a subset is the rays of one camera through every other lens. Its
+pixels are those that see no other set of rays; a pixel between two of them takes part in whole passes only. The
+exponent of subset n is sum_{i in n} w log((I + b) / (P + b)). Its step is that of `lfpiv.reconstruction.steps` with
+max(s_n, s / N) in place of s, where s_n are the weights' sums over the subset and N is the number of subsets. For rows
+of pixels s_n is nearly the same part of s in all voxels, and that part of the volume's light stands for it. Momentum
+goes on from subset to subset [1]_.
 
 Different subsets ask for slightly different volumes, so their steps end in a cycle around the solution. Steps become
 shorter from epoch to epoch, and the last passes take all rays: there the misfit falls in every pass [2]_.
@@ -154,7 +154,7 @@ def subsets_of(cameras: int, sets: int = 1) -> tuple[Subset, ...]:
 
 
 def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
-    """Return a number of subsets in their order: each every so-manieth set of the rays of all cameras, far ones in turn."""
+    """Return subsets, far ones after each other, each of some sets of the rays of all cameras."""
     bits = max(count - 1, 1).bit_length()
     order = (int(f"{number:0{bits}b}"[::-1], 2) for number in range(1 << bits))
     return tuple(
@@ -230,7 +230,9 @@ def iterate_epochs(
             exponent = equations.exponent_of(subset.parts, volume)
             if agreement is not None:
                 agreement.add(exponent)
-            coefficients, after = step(coefficients, exponent, momentum, length=length * of_subset, over=over, in_place=True)
+            coefficients, after = step(
+                coefficients, exponent, momentum, length=length * of_subset, over=over, in_place=True
+            )
             assert after is not None  # with a momentum there is one after it
             momentum = after
         misfit, count = equations.measured(), len(partition.subsets)

@@ -23,7 +23,7 @@ from lfpiv.weights.ray_fit import ray_models
 from lfpiv_kernels.rays.lattice import Lattice, cell_frame, cell_steps, pack_lattice
 from lfpiv_kernels.reconstruction.projector import Blocks
 from lfpiv_kernels.weights import footprint
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, Camera, pack_optics
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, Camera, pack_optics
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera

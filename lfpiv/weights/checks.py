@@ -63,7 +63,8 @@ def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare weights with counted rays in a few random voxels of every camera.
 
     Weights of nodes and profiles of planes stand for those of particles, so there the voxels' own footprints are
-    compared; `choose_planes` and `choose_separable` compared the others. Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+    compared; `choose_planes` and `choose_separable` compared the others. Warn of weights whose error exceeds the aim,
+    unless `choose_form` did so before.
 
     Returns
     -------

@@ -19,7 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lfpiv.lightfield.microimage_layout import microimage_centres
-from lfpiv.progress import StepProgress
+from lfpiv.progress import StepProgress, part_of
 from lfpiv.weights.blocks import PackedCamera
 from lfpiv.weights.counting import draw_seen
 from lfpiv.weights.depth_planes import (
@@ -49,8 +49,8 @@ FEWEST_SETS = 4
 FEWEST_VOXELS = 20_000
 """Voxels of a volume from which on planes share profiles."""
 FAR_ENOUGH = 0.4
-"""Least movement of an image by a voxel of the innermost axis, as a part of the largest one, with which columns lie along
-this axis."""
+"""Least movement of an image by a voxel of the innermost axis, as a part of the largest one, with which columns lie
+along this axis."""
 SAMPLED_PLANES = 3
 """Planes from which the memory of all planes is estimated."""
 SAMPLED_EDGE = 32
@@ -107,7 +107,7 @@ def choose_separable(
         used += planes.estimated_bytes
         if used > limit_bytes:
             return None
-        weights = planes.weights(lambda part, number=number: progress((number + part) / len(cameras)))
+        weights = planes.weights(part_of(progress, number / len(cameras), (number + 1) / len(cameras)))
         if weights is None:
             return None
         projectors[name] = SeparableProjector(weights, ray_sets(cameras))
@@ -211,7 +211,7 @@ class Planes:
         _, planes, columns = self.shape
         profiles = self.profiles
         rays = profiles.ray_rows * self._strips * self._lenses * profiles.pixels * STRIP
-        return self.stored_bytes + RAY_BYTES * rays + lines_bytes(planes, columns)
+        return int(self.stored_bytes + RAY_BYTES * rays + lines_bytes(planes, columns))
 
     def weights(self, progress: StepProgress) -> SeparableWeights | None:
         """Integrate the profiles of all planes; None if a pixel sees too many columns of voxels."""
@@ -336,11 +336,13 @@ class Planes:
 
     @cached_property
     def _first_column(self) -> np.ndarray:
-        return np.floor(self._of_strips.min(1) - _radius_px(self.camera)).astype(np.int32)
+        first: np.ndarray = np.floor(self._of_strips.min(1) - _radius_px(self.camera)).astype(np.int32)
+        return first
 
     @cached_property
     def _first_row(self) -> np.ndarray:
-        return np.floor(self._centres[..., 1].min(1) - _radius_px(self.camera)).astype(np.int32)
+        first: np.ndarray = np.floor(self._centres[..., 1].min(1) - _radius_px(self.camera)).astype(np.int32)
+        return first
 
     @property
     def _middle(self) -> np.ndarray:

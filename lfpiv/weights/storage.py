@@ -126,7 +126,7 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
         arrays: dict[str, np.ndarray] = {}
         camera_sums = _map(folder, header["camera_sums"], arrays)
-        parts = {}
+        parts: dict[str, list[Any]] = {}
         for name, (kind, *entries) in header["cameras"].items():
             kinds = next(kinds for kinds in _STORED if kinds[0].__name__ == kind)
             parts[name] = [
@@ -140,7 +140,7 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     stored = StoredGrid(grid, _tuple(header["order"]))
     share, sets = DeviceShare(cameras.values(), grid), ray_sets(cameras)
     projectors: dict[str, RayProjector] = {
-        name: SeparableProjector(own[0], sets) if isinstance(own[0], SeparableWeights) else share.projector(name, *own)
+        name: SeparableProjector(own[0], sets) if len(own) == 1 else share.projector(name, own[0], own[1])
         for name, own in parts.items()
     }
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))

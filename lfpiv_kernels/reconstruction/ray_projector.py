@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap
+from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, Rays
 from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device
 
 
@@ -21,6 +21,11 @@ class RayProjector:
 
     Arrays in and out are float32, C-contiguous and flat. Those of the device, and all on the CPU, are used in place.
     """
+
+    @property
+    def microimages(self) -> Rays:
+        """Sensor pixel and share of each ray."""
+        raise NotImplementedError
 
     map: RayMap
     """The map from rays to pixels."""
@@ -91,7 +96,7 @@ class RayProjector:
         raise NotImplementedError
 
     def project(self, volume: Values, out: Given, ray_set: int = ALL) -> Given:
-        """Write the image of `volume`, shape (voxel,), by the rays of a set into `out`, shape (pixel,). Return `out`."""
+        """Write the image of `volume`, shape (voxel,), by the rays of a set to `out`, shape (pixel,). Return `out`."""
         with self.reserved():
             if ray_set != ALL:
                 self.rays.zero_()

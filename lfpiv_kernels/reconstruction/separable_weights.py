@@ -45,7 +45,7 @@ class SeparableWeights:
     pixels: int
     """Columns of pixels under a lens."""
     middle: np.ndarray
-    """Pixel row of the microimages' centres, counted from `first_row`, lane by lane, shape (STRIP * strip,), float32."""
+    """Pixel row of the microimages' centres, from `first_row` on, lane by lane, shape (STRIP * strip,), float32."""
     down_first: np.ndarray
     """First row of voxels of each profile down, shape (plane, ray row, strip, block, STRIP), int16; -1 for none."""
     down: np.ndarray
@@ -69,7 +69,7 @@ class SeparableWeights:
     first: np.ndarray
     """First column of a plane that each pixel column of a lens sees, flat, int16."""
     level: np.ndarray
-    """Levels of the profiles across, `taps` x PARTS for each pixel column, flat, uint8. Some more than there are are read."""
+    """Levels of the profiles across, `taps` x PARTS for each pixel column, flat, uint8; a vector more at the end."""
     turn: np.ndarray
     """Columns by which the light of a plane moves from one row of lenses, and one row of pixels, to the next, shape
     (plane, strip, 2), float32."""

@@ -125,7 +125,7 @@ class Blocks:
         return best
 
     def _levels(self, first: int, last: int) -> np.ndarray:
-        """Return the largest level of each voxel from `first` to `last`. With profiles it is a product of two levels."""
+        """Return the largest level of each voxel from `first` to `last`; with profiles a product of two levels."""
         some = slice(self.first_block[first], self.first_block[last])
         width, height = (array[some].astype(np.int64) for array in (self.width, self.height))
         largest = np.zeros(last - first)

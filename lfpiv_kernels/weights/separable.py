@@ -1,9 +1,10 @@
 """Warp: the weights of a camera as profiles that planes of voxels share, from the ray models of the voxels.
 
 The weight of a voxel on a ray is integrated as in ``footprint``, along the two axes of the lenses apart. Where a
-camera's rays are straight, its lenses square and its array upright, the profile along the rows of the sensor is the same
-for all lenses of a row, and that along the columns the same for all voxels that one row of rays sees in a column. So a
-plane has few different profiles [1]_. The loops are C++, see ``separable_weights.h``. Twin: ``reference.separable``.
+camera's rays are straight, its lenses square and its array upright, the profile along the rows of the sensor is the
+same for all lenses of a row, and that along the columns the same for all voxels that one row of rays sees in a column.
+So a plane has few different profiles [1]_. The loops are C++, see ``separable_weights.h``. Twin:
+``reference.separable``.
 
 .. [1] Y. Long, J. A. Fessler, J. M. Balter, "3D forward and back-projection for X-ray CT using separable footprints",
    IEEE Trans. Med. Imaging 29 (2010) 1839-1850, doi:10.1109/TMI.2010.2050898.
@@ -234,7 +235,9 @@ class Profiles:
         Columns and rows of pixels under a lens.
     """
 
-    def __init__(self, camera, lattice, cell_mm, *, frame, first_lens, lens_rows, first_column, first_row, pixels, ray_rows):
+    def __init__(
+        self, camera, lattice, cell_mm, *, frame, first_lens, lens_rows, first_column, first_row, pixels, ray_rows
+    ):
         geometry = np.concatenate([camera.to_numpy(), lattice.to_numpy(), [cell_mm], np.ravel(frame)], dtype=np.float32)
         self._inputs = Inputs()
         self._inputs.geometry = _on_cpu(geometry)
@@ -379,7 +382,9 @@ class PlaneProfiles:
             "first_start": starts([[strip.size for strip in one.first] for one in planes]),
             "level_start": starts([[strip.size for strip in one.level] for one in planes]),
             "first": np.concatenate([strip.ravel() for one in planes for strip in one.first] + [np.zeros(1, np.int16)]),
-            "level": np.concatenate([strip.ravel() for one in planes for strip in one.level] + [np.zeros(STRIP, np.uint8)]),
+            "level": np.concatenate(
+                [strip.ravel() for one in planes for strip in one.level] + [np.zeros(STRIP, np.uint8)]
+            ),
         }
 
 

@@ -85,7 +85,7 @@ def test_images_of_other_particles_are_those_of_footprints(both):
 
 
 def test_errors_of_particles_are_those_of_a_plain_comparison(both):
-    shared, every = both
+    shared = both[0]
     name, stored = "two", shared.stored
     errors = particle_errors(stored, shared.cameras[name], shared.projector(name))
     seen = np.unique(
@@ -165,7 +165,7 @@ def test_counted_rays_are_compared_with_the_voxels_own_footprints(both):
 
 
 def test_particles_are_found_by_subsets_of_rows_as_well_as_by_those_of_lenses(both):
-    shared, every = both
+    every = both[1]
     rng, truth = np.random.default_rng(4), np.zeros(GRID.shape, np.float32)
     for z, y, x in rng.integers(4, np.array(GRID.shape) - 4, (60, 3)):
         truth[z, y, x] += rng.uniform(50, 100)
