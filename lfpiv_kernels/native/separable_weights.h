@@ -175,7 +175,12 @@ LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, flo
         const int column = at_column / PARTS, part = at_column % PARTS;
         const float j = (float)(rays.in.first_j + strip * STRIP + part * (STRIP / PARTS)) + 0.5f * (STRIP / PARTS - 1);
         const Voxel voxel(rays.in, (strip * PARTS + part) * columns + column);
-        const ReachedLenses reached(voxel);
+        RayModel on_sensor = voxel.model;  // the middle of a part may lie beyond it
+        on_sensor.t[0] = min(max(on_sensor.t[0], -g.half_rows * g.pixel), g.half_rows * g.pixel);
+        WeightInputs there = rays.in;
+        there.models = &on_sensor;
+        const Voxel nearest(there, 0);
+        const ReachedLenses reached(nearest);
         if (reached.count == 0) continue;
         for (int i = reached.i0; i <= reached.i1; ++i) {
             const int lens = i - rays.in.first_i;

@@ -176,3 +176,18 @@ def test_particles_are_found_by_subsets_of_rows_as_well_as_by_those_of_lenses(bo
         volume = lfpiv.reconstruct(weights, images, floor=0.01, sieve_voxel=0.7)
         alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
     assert alike[0] > alike[1] and alike[0] > 0.85
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "pitch_deg", "roll_deg"), [(0, 0, 0), (10, 0, 0), (60, 0.5, 1), (88, 0, 0), (45, 5, 0)]
+)
+def test_profiles_serve_up_to_the_edges_of_the_sensor(yaw_deg, pitch_deg, roll_deg, device):
+    """The last strip of lenses has few rows on the sensor here, and the middle of its second part lies beyond it."""
+    seen = IdealCamera("one", rotation(yaw_deg, pitch_deg, roll_deg), optics(420, 460), lattice(roll_deg=0.05))
+    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.6, 2.6, 2.6), voxel_mm=0.074)
+    stored = StoredGrid.for_cameras(grid, [seen], columns_inmost=True)
+    weights = separable.Planes(stored, seen).weights(lambda part: None)
+    rows = separable.microimage_centres(seen.optics, seen.lattice, 0)[1].shape[0]
+    assert 0 < rows % separable.STRIP < 12
+    errors = particle_errors(stored, seen, SeparableProjector(weights, 8))
+    assert np.sqrt(np.mean(np.square(errors))) < PARTICLE_ERROR / 2 and max(errors) < WORST_PARTICLE_ERROR
