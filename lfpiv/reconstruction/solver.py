@@ -25,7 +25,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import ALL
 FEW_CAMERAS = 2
 """Number of cameras up to which "auto" cuts the rays of each camera into two subsets."""
 LEAST_ALONE = 0.8
-"""Least share of a camera's pixels that see lenses of one half only."""
+"""Least share of a camera's pixels that see one set of rays only."""
 
 
 class SmartSolver:
@@ -134,18 +134,22 @@ class SmartSolver:
 
     def _rows_in_subsets(self, cameras: int, sets: int, wanted: int | str) -> tuple[Subset, ...]:
         """Return the subsets where weights can take some rows of pixels alone."""
+        alone = all(self._sees_alone(name) for name in self.weights.cameras)
+        sets = sets if alone else 1  # microimages overlap: most pixels see rows of several sets
         count = wanted if not isinstance(wanted, str) else sets if self.settings.allows_subsets else 1
         if count > sets:
-            raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {count}.")
+            raise ValueError(f"subsets: with these cameras expected {'1 to ' if sets > 1 else ''}{sets}, got {count}.")
         return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)
 
     def _can_halve(self, name: str) -> bool:
         """Return whether most of a camera's pixels see only even or only odd lenses."""
+        return self.weights.projector(name).ray_sets == 2 and self._sees_alone(name)
+
+    def _sees_alone(self, name: str) -> bool:
+        """Return whether most of a camera's pixels see a single set of rays, and each set has some."""
         projector = self.weights.projector(name)
-        if projector.ray_sets != 2:
-            return False
-        even, odd, every = (len(projector.see_only(part)) for part in (0, 1, ALL))
-        return min(even, odd) > 0 and even + odd >= LEAST_ALONE * every
+        alone = [len(projector.see_only(number)) for number in range(projector.ray_sets)]
+        return min(alone) > 0 and sum(alone) >= LEAST_ALONE * len(projector.see_only(ALL))
 
     def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:
         sieve = self.settings.sieve_voxel

@@ -1,17 +1,23 @@
 """Weights as profiles that planes of voxels share: when they are used, and how near they are to voxels' footprints."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 
 import lfpiv
+from lfpiv.reconstruction.ordered_subsets import Subset
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights import separable
 from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.depth_planes import PARTICLE_ERROR, WORST_PARTICLE_ERROR, Sample, blobs_about
 from lfpiv.weights.separable import choose_separable, particle_errors, ray_sets
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
 
 TOLERANCE_SUMS = 0.02
@@ -135,6 +141,15 @@ def test_rows_of_pixels_see_all_of_the_light_once(both):
         assert light.min() > 0.1 * light.mean()
         image = projector.project(np.ones(GRID.size, np.float32), np.zeros(shared.gain(name).size, np.float32))
         assert light.sum() == pytest.approx((image * shared.gain(name))[pixels].sum(), rel=1e-5)
+
+
+def test_overlapping_microimages_are_not_taken_row_by_row(device):
+    wide = IdealCamera("one", rotation(45), replace(optics(260, 280), f_number=2.8), lattice(roll_deg=0.05))
+    weights = lfpiv.build_weights(rig_of(wide), GRID)
+    assert weights.has_ray_rows  # profiles are shared all the same
+    assert SmartSolver(weights, SmartSettings()).subsets == (Subset(((0, ALL),)),)
+    with pytest.raises(ValueError, match=r"subsets: with these cameras expected 1, got 4\."):
+        _ = SmartSolver(weights, SmartSettings(subsets=4)).subsets
 
 
 def test_stored_weights_are_opened_as_they_were(both, tmp_path):
