@@ -119,31 +119,22 @@ class SmartSolver:
             If the rays cannot be cut into the number of subsets that the settings ask for.
         """
         cameras, wanted = len(self.weights.cameras), self.settings.subsets
-        projectors = [self.weights.projector(name) for name in self.weights.cameras]
-        if self.weights.has_ray_rows:
-            return self._rows_in_subsets(cameras, min(projector.ray_sets for projector in projectors), wanted)
-        halves = all(self._can_halve(name) for name in self.weights.cameras)
-        possible = sorted({1, cameras, 2 * cameras if halves else 1})
+        sets = min(self.weights.projector(name).ray_sets for name in self.weights.cameras)
+        if not all(self._sees_alone(name) for name in self.weights.cameras):
+            sets = 1
+        if self.weights.has_ray_rows and sets > 1:
+            count = wanted if not isinstance(wanted, str) else sets if self.settings.allows_subsets else 1
+            if count > sets:
+                raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {count}.")
+            return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)
+        possible = sorted({1, cameras, sets * cameras})
         if isinstance(wanted, str):
-            few = cameras <= FEW_CAMERAS or not halves
+            few = cameras <= FEW_CAMERAS or sets == 1
             wanted = (possible[-1] if few else cameras) if self.settings.allows_subsets else 1
         if wanted not in possible:
             numbers = ", ".join(map(str, possible))
             raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
         return subsets_of(cameras, 2 if wanted == 2 * cameras else 1) if wanted > 1 else subsets_of(1)
-
-    def _rows_in_subsets(self, cameras: int, sets: int, wanted: int | str) -> tuple[Subset, ...]:
-        """Return the subsets where weights can take some rows of pixels alone."""
-        alone = all(self._sees_alone(name) for name in self.weights.cameras)
-        sets = sets if alone else 1  # microimages overlap: most pixels see rows of several sets
-        count = wanted if not isinstance(wanted, str) else sets if self.settings.allows_subsets else 1
-        if count > sets:
-            raise ValueError(f"subsets: with these cameras expected {'1 to ' if sets > 1 else ''}{sets}, got {count}.")
-        return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)
-
-    def _can_halve(self, name: str) -> bool:
-        """Return whether most of a camera's pixels see only even or only odd lenses."""
-        return self.weights.projector(name).ray_sets == 2 and self._sees_alone(name)
 
     def _sees_alone(self, name: str) -> bool:
         """Return whether most of a camera's pixels see a single set of rays, and each set has some."""

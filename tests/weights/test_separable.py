@@ -144,11 +144,15 @@ def test_rows_of_pixels_see_all_of_the_light_once(both):
 
 
 def test_overlapping_microimages_are_not_taken_row_by_row(device):
-    wide = IdealCamera("one", rotation(45), replace(optics(260, 280), f_number=2.8), lattice(roll_deg=0.05))
-    weights = lfpiv.build_weights(rig_of(wide), GRID)
+    """Most pixels see rays of two lenses there, and so of two sets of rows: subsets are whole cameras."""
+    wide = [
+        IdealCamera(name, rotation(yaw), replace(optics(260, 280), f_number=2.8), lattice(roll_deg=0.05))
+        for name, yaw in (("one", 45), ("two", -45))
+    ]
+    weights = lfpiv.build_weights(rig_of(*wide), GRID)
     assert weights.has_ray_rows  # profiles are shared all the same
-    assert SmartSolver(weights, SmartSettings()).subsets == (Subset(((0, ALL),)),)
-    with pytest.raises(ValueError, match=r"subsets: with these cameras expected 1, got 4\."):
+    assert SmartSolver(weights, SmartSettings()).subsets == (Subset(((0, ALL),)), Subset(((1, ALL),)))
+    with pytest.raises(ValueError, match=r"subsets: with these cameras expected one of 1, 2, got 4\."):
         _ = SmartSolver(weights, SmartSettings(subsets=4)).subsets
 
 
