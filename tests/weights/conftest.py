@@ -2,12 +2,12 @@
 
 import pytest
 
-from lfpiv.weights import counting
-
 
 @pytest.fixture(scope="module", autouse=True)
 def whole_count_of_module(one_counted_voxel):
     """Undo `one_counted_voxel`."""
+    from lfpiv.weights import counting  # not before kernels know which loops to take
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(counting, "VOXELS", one_counted_voxel)
         yield
