@@ -45,7 +45,7 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
     device = device or where.warp
     for call in calls:
         load(call.kernel, device)  # before threads start: compilation is not thread-safe
-    on_cpu = where.form == "cpu"
+    on_cpu = runtime.on_threads(device)
     if not on_cpu:
         parts = 1
     elif parts is None:
@@ -67,7 +67,7 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
             if call.scratch:
                 free.append(slot)
 
-    runtime.run_chunks(len(calls) * parts, run, chunks=len(calls) * parts)
+    runtime.run_chunks(len(calls) * parts, run, chunks=len(calls) * parts, warp_device=device)
 
 
 def load(kernel: wp.Kernel, device: str) -> None:

@@ -237,14 +237,22 @@ def device_of_taichi() -> Device:
     return replace(where, form="gpu") if TAICHI else where
 
 
-def run_chunks(size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS) -> None:
+def on_threads(warp_device: str) -> bool:
+    """Return whether work on a device runs in parts on the CPU's threads: not on a GPU, nor where one is emulated."""
+    return warp_device == "cpu" and (device().form == "cpu" or device().kind == "cuda")
+
+
+def run_chunks(
+    size: int, job: Callable[[int, int, int], None], *, chunks: int = CHUNKS, warp_device: str | None = None
+) -> None:
     """Call ``job(chunk, first, last)`` for contiguous parts of ``range(size)``: on threads on the CPU, once on CUDA.
 
     A Warp launch on the CPU runs on one thread and releases the GIL, so Python threads scale. Jobs must write disjoint
     memory. Exceptions of a job are raised here. Kernels whose parts need nothing else are launched by ``launch``.
+    `warp_device` is Warp's name of the device that the job uses; default: the running one.
     """
     where = device()
-    if where.form == "gpu":
+    if not on_threads(warp_device or where.warp):
         job(0, 0, size)
         return
     edges = [size * part // chunks for part in range(chunks + 1)]

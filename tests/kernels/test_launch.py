@@ -1,9 +1,12 @@
 """Launches of Warp kernels in parts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
 
+from lfpiv_kernels import runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.transfer import to_device
 
@@ -46,6 +49,18 @@ def test_parts_that_run_side_by_side_have_scratch_memory_of_their_own(device):
     launch(Call(_note_slot, 1000, [], [slots], scratch=True))
     found = slots.numpy()
     assert (found == -1).all() if device.form == "gpu" else (found.min() >= 0 and found.max() < 8)
+
+
+def test_work_of_the_host_beside_a_gpu_runs_on_the_threads(device, monkeypatch):
+    on_gpu = replace(device, kind="cuda", form="gpu", threads=2)
+    monkeypatch.setattr(runtime, "device", lambda: on_gpu)
+    slots = to_device(np.full(1000, -2, np.int32), device="cpu")
+    launch(Call(_note_slot, 1000, [], [slots], scratch=True), device="cpu")
+    found = slots.numpy()
+    assert found.min() >= 0 and found.max() < 8
+    chunks = []
+    runtime.run_chunks(10, lambda *chunk: chunks.append(chunk))
+    assert chunks == [(0, 0, 10)]
 
 
 def test_arrays_on_the_cpu_are_views():
