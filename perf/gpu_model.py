@@ -142,7 +142,7 @@ class Model:
         if refinement != 1.0:
             edge = voxels.voxel_mm / refinement
             voxels = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.1 * of["voxels"],) * 3, voxel_mm=edge)
-        with patch.object(separable, "are_possible", lambda *_: False):  # as on a GPU
+        with patch.object(separable, "are_possible", lambda *_: False):  # the weights of voxels
             weights = lfpiv.build_weights(rig(of["sensor"]), voxels, form=form)
         first, *others = map(weights.projector, weights.cameras)
         with loops_for_a_gpu():

@@ -33,8 +33,9 @@ from lfpiv.weights.blocks import (
 from lfpiv.weights.choice import Choice, choose_form, choose_uncounted
 from lfpiv.weights.counting import CountedVoxels
 from lfpiv.weights.depth_planes import NodeGrid, choose_planes, line_of_sight
+from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.operator import Weights, build_weights
-from lfpiv.weights.separable import Planes, are_possible, choose_separable, ray_sets
+from lfpiv.weights.separable import Planes, choose_separable, possible_planes, ray_sets
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
@@ -166,11 +167,16 @@ class Volume:
             choices[name] = (
                 choose_form(CountedVoxels(stored, camera)) if square else choose_uncounted(stored, camera, wanted)
             )
-        if all(choice.form == "profiles" for choice in choices.values()) and self._shares_profiles():
-            across = StoredGrid.for_cameras(self.finest.grid, self.cameras.values(), columns_inmost=True)
+        profiles = all(choice.form == "profiles" for choice in choices.values())
+        if profiles and (shared := self._shared_profiles()) is not None:
             return {
-                name: Form(choice=choices[name], separable=True, stored_bytes=Planes(across, camera).stored_bytes)
-                for name, camera in self.cameras.items()
+                name: Form(
+                    choice=choices[name],
+                    separable=True,
+                    stored_bytes=planes.stored_bytes,
+                    device_bytes=planes.device_bytes,
+                )
+                for name, planes in shared.items()
             }
         return {
             name: self._blocks_form(
@@ -184,13 +190,21 @@ class Volume:
             for name, camera in self.cameras.items()
         }
 
-    def _shares_profiles(self) -> bool:
-        """Return whether planes of voxels share profiles, as `build_weights` finds out: here in a part."""
-        grid, cameras = self.finest.grid, self.cameras
-        if not are_possible(StoredGrid.for_cameras(grid, cameras.values()), cameras):
-            return False
-        part = StoredGrid.for_cameras(self.part(CHECKED_VOXELS).finest.grid, cameras.values(), columns_inmost=True)
-        return choose_separable(part, cameras, math.inf, _ignore) is not None
+    def _shared_profiles(self) -> dict[str, Planes] | None:
+        """Return the planes of voxels if they share profiles, as `build_weights` finds out.
+
+        Their accuracy is that of a part.
+        """
+        cameras = self.cameras
+
+        def free(grid: Grid) -> tuple[StoredGrid, Mapping[str, CalibratedCamera], DeviceShare]:
+            stored = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
+            return stored, cameras, DeviceShare(cameras.values(), grid)
+
+        planes = possible_planes(*free(self.finest.grid))
+        if planes is None or choose_separable(*free(self.part(CHECKED_VOXELS).finest.grid), math.inf, _ignore) is None:
+            return None
+        return planes
 
     def _blocks_form(
         self, stored: StoredGrid, camera: CalibratedCamera, choice: Choice, nodes: NodeGrid | None

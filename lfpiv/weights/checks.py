@@ -9,9 +9,9 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.weights.blocks import BLOCK_BYTES, CHUNK_VOXELS, VOXEL_BYTES, PackedCamera, sample_blocks
 from lfpiv.weights.choice import form_errors, warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
-from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
+from lfpiv.weights.device_share import DeviceNeed, DeviceShare, beside_bytes, rays_bytes
 from lfpiv.weights.operator import Weights
-from lfpiv.weights.separable import separable_bytes
+from lfpiv.weights.separable import Planes, possible_planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector import Projector
@@ -27,10 +27,8 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto", pa
 
     Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
     """
-    runtime.device()
-    stored = StoredGrid(grid, (0, 1, 2))
-    if form != "pixels" and (separable := separable_bytes(stored, calibration.cameras)) is not None:
-        return separable
+    if (separable := _planes(calibration, grid, form)) is not None:
+        return sum(planes.estimated_bytes for planes in separable.values())
     total = 0.0
     for camera, (_, size, blocks, values) in _samples(calibration, grid, form, particle_voxel):
         rays = rays_bytes(camera)
@@ -40,11 +38,25 @@ def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto", pa
 
 def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto") -> DeviceNeed:
     """Do as `estimate_memory` for the memory of a GPU, volumes, images and correlation included."""
+    beside = beside_bytes(calibration.cameras.values(), grid)
+    if (separable := _planes(calibration, grid, form)) is not None:
+        return DeviceNeed(tuple(planes.device_bytes for planes in separable.values()), beside)
     sizes = tuple(
         device_bytes(chosen, size, int(blocks * size), int(values * size), edge=camera.microimages.edge)
         for camera, (chosen, size, blocks, values) in _samples(calibration, grid, form, 0.0)
     )
-    return DeviceNeed(sizes, beside_bytes(calibration.cameras.values(), grid))
+    return DeviceNeed(sizes, beside)
+
+
+def _planes(calibration: Calibration, grid: Grid, form: str) -> dict[str, Planes] | None:
+    """Return the planes of each camera whose profiles are shared, if these may suit."""
+    runtime.device()
+    cameras = calibration.cameras
+    return (
+        None
+        if form == "pixels"
+        else possible_planes(StoredGrid(grid, (0, 1, 2)), cameras, DeviceShare(cameras.values(), grid))
+    )
 
 
 def _samples(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,10 @@ from lfpiv.geometry.grid import Grid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
+from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
 from lfpiv_kernels.reconstruction.projector_streamed import SLAB_BYTES, least_bytes
+from lfpiv_kernels.reconstruction.separable_gpu import device_bytes
+from lfpiv_kernels.reconstruction.separable_weights import PARTS, SeparableWeights
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -102,6 +105,32 @@ class DeviceShare:
         self._left = None if free is None else free - beside_bytes(cameras, grid)
         self._to_come = len(cameras)
         self._shape = grid.shape
+
+    def holds(self, sizes: Iterable[int]) -> bool:
+        """Return whether the weights of all cameras [byte] fit at once; those of the CPU always do."""
+        return self._left is None or sum(max(size, least_bytes()) for size in sizes) <= self._left
+
+    def separable(self, name: str, weights: SeparableWeights, sets: int) -> SeparableProjector:
+        """Make the projector of the next camera from profiles of planes, which are not streamed.
+
+        Raises
+        ------
+        InputError
+            If they do not fit into the memory that is left.
+        """
+        self._to_come -= 1
+        _, planes, columns = weights.shape
+        lines, rays = (planes * weights.strips, columns), weights.ray_rows * weights.rays_of_row
+        size = device_bytes(weights.nbytes, weights.level.size // PARTS, lines, rays, weights.ray_rows)
+        if self._left is not None and size > self._left:
+            raise InputError(
+                f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
+                f"{size_text(max(self._left, 0))} are left. Use fewer workers per GPU, or --device cpu."
+            )
+        projector = SeparableProjector(weights, sets)
+        if self._left is not None:
+            self._left -= projector.device_bytes
+        return projector
 
     def projector(self, name: str, blocks: Blocks, planes: PlaneShares | None = None) -> Projector:
         """Make the projector of the next camera. Its weights are streamed where they do not fit.

@@ -400,7 +400,7 @@ def build_weights(
             choices[name] = choose_uncounted(stored, camera, form)
     if planes and choices and all(choice.form == "profiles" for choice in choices.values()):
         columns_inmost = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
-        separable = choose_separable(columns_inmost, cameras, limit_bytes, whole)
+        separable = choose_separable(columns_inmost, cameras, share, limit_bytes, whole)
         if separable is not None:
             stored = columns_inmost
             projectors.update(separable)

@@ -32,13 +32,14 @@ from lfpiv.weights.depth_planes import (
 )
 from lfpiv.weights.ray_fit import grid_models
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector_separable import MOST_VALUES, SeparableProjector, lines_bytes
-from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, PARTS, STRIP, SeparableWeights
-from lfpiv_kernels.weights.separable import MOST_TAPS, PlaneProfiles, Profiles
+from lfpiv_kernels.reconstruction.separable_gpu import device_bytes
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, MOST_TAPS, PARTS, STRIP, SeparableWeights
+from lfpiv_kernels.weights.separable import PlaneProfiles, Profiles
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.weights.device_share import DeviceShare
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,7 @@ def _radius_px(camera: CalibratedCamera) -> float:
 def choose_separable(
     stored: StoredGrid,
     cameras: Mapping[str, CalibratedCamera],
+    share: DeviceShare,
     limit_bytes: float,
     progress: StepProgress,
 ) -> dict[str, SeparableProjector] | None:
@@ -85,6 +87,8 @@ def choose_separable(
         The voxels.
     cameras : mapping of str to CalibratedCamera
         The cameras, whose weights can be products of profiles.
+    share : DeviceShare
+        Free memory of the GPU, of which nothing is taken yet.
     limit_bytes : float
         Memory that the weights may take [byte].
     progress : callable
@@ -95,23 +99,16 @@ def choose_separable(
     dict of str to SeparableProjector, or None
         None if the weights of all voxels, or of nodes, are to be stored.
     """
-    used = 0
-    if not are_possible(stored, cameras):
+    each = possible_planes(stored, cameras, share)
+    if each is None or sum(planes.estimated_bytes for planes in each.values()) > limit_bytes:
         return None
     projectors = {}
-    for number, (name, camera) in enumerate(cameras.items()):
-        planes = Planes(stored, camera)
-        if not planes.possible:
-            log.debug("%s: a pixel sees too many voxels side by side for profiles of planes", name)
-            return None
-        used += planes.estimated_bytes
-        if used > limit_bytes:
-            return None
+    for number, (name, planes) in enumerate(each.items()):
         weights = planes.weights(part_of(progress, number / len(cameras), (number + 1) / len(cameras)))
         if weights is None:
             return None
         projectors[name] = SeparableProjector(weights, ray_sets(cameras))
-        errors = particle_errors(stored, camera, projectors[name])
+        errors = particle_errors(stored, planes.camera, projectors[name])
         error = float(np.sqrt(np.mean(np.square(errors)))) if errors else math.inf
         log.debug("%s: profiles of planes: images of particles differ by %.1f %%", name, 100 * error)
         if not (error <= PARTICLE_ERROR and max(errors) <= WORST_PARTICLE_ERROR):
@@ -119,22 +116,30 @@ def choose_separable(
     return projectors
 
 
-def are_possible(stored: StoredGrid, cameras: Mapping[str, CalibratedCamera]) -> bool:
-    """Return whether profiles of planes may suit the cameras, by their lenses and the size of the volume."""
-    square = all(camera.lattice.layout == "square" for camera in cameras.values())
-    large = stored.size >= FEWEST_VOXELS
-    return square and large and ray_sets(cameras) >= FEWEST_SETS and runtime.device().form == "cpu"
+def possible_planes(
+    stored: StoredGrid, cameras: Mapping[str, CalibratedCamera], share: DeviceShare
+) -> dict[str, Planes] | None:
+    """Return the planes of all cameras; None where their profiles do not suit the cameras or do not fit a GPU.
 
-
-def separable_bytes(stored: StoredGrid, cameras: Mapping[str, CalibratedCamera]) -> int | None:
-    """Estimate the memory of profiles of planes and their rays [byte]; None where they do not suit the cameras.
-
-    Whether they are accurate is not looked at.
+    Whether they are accurate is not looked at. They cannot be streamed, as the weights of voxels can.
     """
     if not are_possible(stored, cameras):
         return None
-    each = [Planes(stored, camera) for camera in cameras.values()]
-    return sum(one.estimated_bytes for one in each) if all(one.possible for one in each) else None
+    each = {name: Planes(stored, camera) for name, camera in cameras.items()}
+    for name, planes in each.items():
+        if not planes.possible:
+            log.debug("%s: a pixel sees too many voxels side by side for profiles of planes", name)
+            return None
+    if not share.holds([planes.device_bytes for planes in each.values()]):
+        log.debug("profiles of planes do not fit the memory of the GPU")
+        return None
+    return each
+
+
+def are_possible(stored: StoredGrid, cameras: Mapping[str, CalibratedCamera]) -> bool:
+    """Return whether profiles of planes may suit the cameras, by their lenses and the size of the volume."""
+    square = all(camera.lattice.layout == "square" for camera in cameras.values())
+    return square and stored.size >= FEWEST_VOXELS and ray_sets(cameras) >= FEWEST_SETS
 
 
 def particle_errors(stored: StoredGrid, camera: CalibratedCamera, projector: SeparableProjector) -> list[float]:
@@ -201,17 +206,31 @@ class Planes:
         """Memory of the profiles [byte], about."""
         blocks = -(-self.shape[2] // COLUMN_BLOCK)
         rows = self.profiles.ray_rows * self._strips * blocks * STRIP
-        pixels = self._strips * self._lenses * self.profiles.pixels
         down, across = (float(np.mean(taps)) for taps in self._taps)
-        return int(self.shape[1] * (rows * (2 + COLUMN_BLOCK * down) + pixels * (2 + PARTS * across)))
+        return int(self.shape[1] * (rows * (2 + COLUMN_BLOCK * down) + self._pixels * (2 + PARTS * across)))
 
     @property
     def estimated_bytes(self) -> int:
         """Memory of the profiles and of the rays [byte], about."""
         _, planes, columns = self.shape
-        profiles = self.profiles
-        rays = profiles.ray_rows * self._strips * self._lenses * profiles.pixels * STRIP
-        return int(self.stored_bytes + RAY_BYTES * rays + lines_bytes(planes, columns))
+        return self.stored_bytes + RAY_BYTES * self._rays + lines_bytes(planes, columns)
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory of the profiles on a GPU, and of what projects with them [byte], about."""
+        _, planes, columns = self.shape
+        seen = int(planes * self._pixels * np.mean(self._taps[1]))
+        lines = planes * self._strips, columns
+        return device_bytes(self.stored_bytes, seen, lines, self._rays, self.profiles.ray_rows)
+
+    @property
+    def _pixels(self) -> int:
+        """Columns of pixels under the lenses of all strips."""
+        return int(self._strips * self._lenses * self.profiles.pixels)
+
+    @property
+    def _rays(self) -> int:
+        return int(self.profiles.ray_rows * self._pixels * STRIP)
 
     def weights(self, progress: StepProgress) -> SeparableWeights | None:
         """Integrate the profiles of all planes; None if a pixel sees too many columns of voxels."""

@@ -140,7 +140,7 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     stored = StoredGrid(grid, _tuple(header["order"]))
     share, sets = DeviceShare(cameras.values(), grid), ray_sets(cameras)
     projectors: dict[str, RayProjector] = {
-        name: SeparableProjector(own[0], sets) if len(own) == 1 else share.projector(name, own[0], own[1])
+        name: share.separable(name, own[0], sets) if len(own) == 1 else share.projector(name, own[0], own[1])
         for name, own in parts.items()
     }
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))

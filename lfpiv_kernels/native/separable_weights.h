@@ -4,7 +4,7 @@
 #define LFPIV_SEPARABLE_WEIGHTS_H
 
 #include "microimages.h"
-#include "separable.h"
+#include "separable_layout.h"
 #include "smears.h"
 
 namespace lfpiv {

@@ -2,7 +2,8 @@
 
 Light goes from the voxels of a plane down to its line, which one ray row of a strip of lenses sees, and from lines
 across to rays. Each ray is computed by one thread, and so is each plane of voxels in the adjoint: results do not depend
-on the number of threads. The loops are C++, see ``separable.h``. Twin: ``reference.separable``.
+on the number of threads. The loops are C++, see ``separable.h``; a GPU has those of ``separable_gpu``. Twin:
+``reference.separable``.
 """
 
 from dataclasses import replace
@@ -15,50 +16,19 @@ from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
-from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, STRIP, SeparableWeights
+from lfpiv_kernels.reconstruction.separable_gpu import LinesProjector
+from lfpiv_kernels.reconstruction.separable_layout import Separable, on_device
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, MOST_TAPS, STRIP, SeparableWeights
 from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, to_host, zeros
 
 wp.set_module_options(native.options("separable.h", contract="fast"))
 
-MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
-"""Most columns of a plane that a pixel sees."""
 LENS_BLOCK: int = native.constant("separable.h", "LENS_BLOCK")
 """Fewest lenses in a row whose rays a thread computes."""
 LEAST_TASKS = 4
 """Fewest tasks of a projection for each thread."""
 MOST_VALUES: int = native.constant("separable.h", "MOST_VALUES")
 """Most values of the profiles across of a lens, which a thread has room for."""
-
-
-@wp.struct
-class Separable:
-    """The arrays of `SeparableWeights` on the device, see ``SeparableArrays``."""
-
-    rows: int
-    planes: int
-    columns: int
-    row_stride: int
-    plane_stride: int
-    strips: int
-    lenses: int
-    pixels: int
-    ray_rows: int
-    blocks: int
-    down_first: wp.array(dtype=wp.int16)
-    down: wp.array(dtype=wp.uint8)
-    down_start: wp.array(dtype=wp.int64)
-    down_taps: wp.array(dtype=int)
-    down_scale: wp.array(dtype=float)
-    lens: wp.array(dtype=int)
-    lens_count: wp.array(dtype=int)
-    taps: wp.array(dtype=int)
-    first_start: wp.array(dtype=wp.int64)
-    level_start: wp.array(dtype=wp.int64)
-    first: wp.array(dtype=wp.int16)
-    level: wp.array(dtype=wp.uint8)
-    turn: wp.array(dtype=float)
-    middle: wp.array(dtype=float)
-    rim: wp.array(dtype=wp.int8)
 
 
 @wp.func_native("""
@@ -180,14 +150,16 @@ class SeparableProjector(RayProjector):
         super().__init__()
         self.weights, self.ray_sets = weights, sets
         self.form, self.nbytes = weights.form, weights.nbytes
-        _, planes, columns = weights.shape
-        self._moved = weights.axes[2] != 2
-        """Whether columns must be brought together in memory first."""
-        self._arrays = self._on_device(weights)
         self.rays = zeros(weights.ray_rows * weights.rays_of_row)
         self.returned = zeros(weights.ray_rows * weights.rays_of_row)
-        self._turned = empty(weights.rays_of_row)
-        self._lines = zeros(lines_bytes(planes, columns) // 4)
+        self._on_gpu = LinesProjector(weights) if runtime.device().form == "gpu" else None
+        if self._on_gpu is None:
+            _, planes, columns = weights.shape
+            self._moved = weights.axes[2] != 2
+            """Whether columns must be brought together in memory first."""
+            self._arrays = self._on_cpu(weights)
+            self._turned = empty(weights.rays_of_row)
+            self._lines = zeros(lines_bytes(planes, columns) // 4)
         self.map = self._map_rays()
 
     @property
@@ -195,22 +167,15 @@ class SeparableProjector(RayProjector):
         """Pixel and share of each ray."""
         return self.weights
 
-    def _on_device(self, weights: SeparableWeights) -> Separable:
-        """Return the arrays of weights for the kernels."""
-        rows, planes, columns = weights.shape
-        strides = weights.voxels[1] * weights.voxels[2], weights.voxels[2], 1
-        arrays = Separable()
-        arrays.rows, arrays.planes, arrays.columns = rows, planes, columns
-        arrays.row_stride = planes * columns if self._moved else strides[weights.axes[0]]
-        arrays.plane_stride = columns if self._moved else strides[weights.axes[1]]
-        for name in ("strips", "lenses", "pixels", "ray_rows", "blocks"):
-            setattr(arrays, name, getattr(weights, name))
-        for name in (
-            *("down_first", "down", "down_start", "down_taps", "down_scale", "lens", "lens_count", "taps"),
-            *("first_start", "level_start", "first", "level", "turn", "middle", "rim"),
-        ):
-            setattr(arrays, name, to_device(getattr(weights, name).ravel()))
-        return arrays
+    @property
+    def device_bytes(self) -> int:
+        """Memory of a GPU that the weights and the loops take, beside `rays` [byte]; 0 on the CPU."""
+        return 0 if self._on_gpu is None else self._on_gpu.nbytes + self.returned.size * 4
+
+    def _on_cpu(self, weights: SeparableWeights) -> Separable:
+        """Return the arrays of weights for the CPU's kernels."""
+        _, planes, columns = weights.shape
+        return on_device(weights, (planes * columns, columns, 1) if self._moved else weights.strides)
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
@@ -227,6 +192,9 @@ class SeparableProjector(RayProjector):
     def scatter(self, volume: Values, ray_set: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of a set. Other rays stay as they are."""
         light, rows = to_device(volume, float), self._ray_rows(ray_set)
+        if self._on_gpu is not None:
+            self._on_gpu.scatter(light, rows, self.rays)
+            return
         if self._moved:
             light = _transposed(light, self.weights.voxels, self.weights.axes)
         parts = runtime.CHUNKS
@@ -246,6 +214,10 @@ class SeparableProjector(RayProjector):
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
         volume, mask = to_device(out, float), None if active is None else to_device(active, float)
+        if self._on_gpu is not None:
+            self._on_gpu.gather(self.returned, self._ray_rows(ray_set), mask, volume)
+            overwrite(out, volume)
+            return out
         found = volume if mask is None and not self._moved else zeros(volume.size)
         found = self._gather(self._arrays, self.returned, ray_set, found)
         if found is not volume:
@@ -267,9 +239,9 @@ class SeparableProjector(RayProjector):
 
     def darken(self, ray_set: int = ALL) -> None:
         """Make the rays of a set dark that `gather` reads."""
-        returned, size = to_host(self.returned), self.weights.rays_of_row
+        size = self.weights.rays_of_row
         for row in self._ray_rows(ray_set):
-            returned[row * size : (row + 1) * size] = 0.0
+            self.returned[row * size : (row + 1) * size].zero_()
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,)."""
@@ -284,6 +256,9 @@ class SeparableProjector(RayProjector):
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32."""
         weights = self.weights
+        if self._on_gpu is not None:
+            with self.reserved():
+                return self._on_gpu.count_lit()
         lit = replace(
             weights,
             down=(weights.down > 0).astype(np.uint8),
@@ -294,7 +269,7 @@ class SeparableProjector(RayProjector):
         )
         with self.reserved():
             seen = to_device((weights.share > 0).astype(np.float32))
-            count = self._gather(self._on_device(lit), seen, ALL, zeros(int(np.prod(weights.voxels))))
+            count = self._gather(self._on_cpu(lit), seen, ALL, zeros(int(np.prod(weights.voxels))))
         return np.rint(to_host(count)).astype(np.int32)
 
     def largest_weight(self) -> float:

@@ -6,12 +6,14 @@ import numpy as np
 
 from lfpiv_kernels import native
 
-STRIP: int = native.constant("separable.h", "STRIP")
+STRIP: int = native.constant("separable_layout.h", "STRIP")
 """Rows of lenses side by side."""
-PARTS: int = native.constant("separable.h", "PARTS")
+PARTS: int = native.constant("separable_layout.h", "PARTS")
 """Parts of a strip with profiles across of their own; their rows of lenses take turns."""
-COLUMN_BLOCK: int = native.constant("separable.h", "COLUMN_BLOCK")
+COLUMN_BLOCK: int = native.constant("separable_layout.h", "COLUMN_BLOCK")
 """Columns of a plane whose profiles down begin at the same row of voxels."""
+MOST_TAPS: int = native.constant("separable_layout.h", "MOST_TAPS")
+"""Most columns of a plane that a pixel sees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,13 @@ class SeparableWeights:
     def shape(self) -> tuple[int, int, int]:
         """Rows, planes and columns of voxels."""
         rows, planes, columns = (self.voxels[axis] for axis in self.axes)
+        return rows, planes, columns
+
+    @property
+    def strides(self) -> tuple[int, int, int]:
+        """Voxels in memory from one row, plane and column to the next."""
+        of_axes = self.voxels[1] * self.voxels[2], self.voxels[2], 1
+        rows, planes, columns = (of_axes[axis] for axis in self.axes)
         return rows, planes, columns
 
     @property

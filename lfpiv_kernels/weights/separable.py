@@ -18,15 +18,13 @@ import warp as wp
 
 from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, PARTS, STRIP
+from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, MOST_TAPS, PARTS, STRIP
 from lfpiv_kernels.transfer import to_device
 from lfpiv_kernels.weights.footprint_arrays import Inputs
 from lfpiv_kernels.weights.ray_model import LEVELS
 
 wp.set_module_options(native.options("separable_weights.h", contract="fast"))
 
-MOST_TAPS: int = native.constant("separable.h", "MOST_TAPS")
-"""Most columns of a plane that a pixel sees."""
 COMPILED_TAPS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)
 """Numbers of columns for which there are loops, see ``with_taps``."""
 LEAST = 0.5 / LEVELS

@@ -14,11 +14,10 @@ import lfpiv_kernels
 from lfpiv_kernels import native, runtime
 
 HEADERS = sorted(native.FOLDER.glob("*.h"))
-CPU_ONLY = {  # a GPU has ``neighbours_gpu`` and ``projector_gpu`` instead
+CPU_ONLY = {  # a GPU has ``neighbours_gpu``, ``projector_gpu`` and ``separable_gpu`` instead
     "lfpiv_kernels.correlation.neighbours",
     "lfpiv_kernels.reconstruction.projector",
     "lfpiv_kernels.reconstruction.projector_separable",
-    "lfpiv_kernels.weights.separable",
 }
 CHECKOUT = Path(__file__).resolve().parents[2] / "lfpiv_kernels" / "native"  # the format's file is not installed
 

@@ -8,8 +8,11 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.weights.separable import Planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference
+from lfpiv_kernels.reconstruction import separable_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+from lfpiv_kernels.reconstruction.separable_gpu import LinesProjector
+from lfpiv_kernels.transfer import to_device, to_host, zeros
 
 ROUNDING = 2e-6
 """Largest difference of float32 sums of some hundred terms, as a part of the largest value."""
@@ -106,6 +109,27 @@ def test_images_do_not_depend_on_threads(case, monkeypatch):
     found = projector.project(volume, np.zeros(pixels, np.float32))
     monkeypatch.setattr("lfpiv_kernels.reconstruction.projector_separable.LEAST_TASKS", 100)  # short segments
     np.testing.assert_array_equal(projector.project(volume, np.zeros(pixels, np.float32)), found)
+
+
+@pytest.mark.parametrize("at_once", ["all ray rows", "one ray row"])
+def test_loops_for_a_gpu_give_the_light_of_those_for_the_cpu(case, at_once, monkeypatch):
+    _, weights, projector, matrix = case
+    if at_once == "one ray row":
+        monkeypatch.setattr(separable_gpu, "LINES_BYTES", 0)
+    lines, rng = LinesProjector(weights), np.random.default_rng(8)
+    volume, light = (rng.random(size).astype(np.float32) for size in matrix.shape[::-1])
+    for ray_set, ray_rows in ((ALL, range(weights.ray_rows)), (1, range(1, weights.ray_rows, SETS))):
+        rays, gathered = zeros(len(light)), zeros(len(volume))
+        lines.scatter(to_device(volume), ray_rows, rays)
+        lines.gather(to_device(light), ray_rows, None, gathered)
+        with projector.reserved():
+            projector.rays.zero_()
+            projector.scatter(volume, ray_set)
+            projector.returned.assign(light)
+            expected = to_host(projector.rays), projector.gather(np.zeros_like(volume), ray_set=ray_set)
+        for found, one in zip((rays, gathered), expected, strict=True):
+            np.testing.assert_allclose(to_host(found), one, atol=ROUNDING * one.max())
+    np.testing.assert_array_equal(lines.count_lit(), projector.count_lit())
 
 
 def test_entries_are_columns_of_the_matrix(case):

@@ -8,15 +8,19 @@ from scipy import ndimage
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 
 import lfpiv
+from lfpiv.errors import InputError
+from lfpiv.files import MIB
 from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights import separable
-from lfpiv.weights.checks import compare_with_count, estimate_memory
+from lfpiv.weights.checks import compare_with_count, estimate_device_need, estimate_memory
 from lfpiv.weights.depth_planes import PARTICLE_ERROR, WORST_PARTICLE_ERROR, Sample, blobs_about
-from lfpiv.weights.separable import choose_separable, particle_errors, ray_sets
+from lfpiv.weights.device_share import DeviceShare, beside_bytes
+from lfpiv.weights.separable import choose_separable, particle_errors, possible_planes, ray_sets
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
 
@@ -33,6 +37,10 @@ def rig_of(*cameras):
 
 def camera(name="one", yaw_deg=45.0, roll_deg=0.0, layout="square"):
     return IdealCamera(name, rotation(yaw_deg, 0.2), optics(260, 280, layout), lattice(layout, roll_deg))
+
+
+def share_of(cameras):
+    return DeviceShare(cameras.values(), GRID)
 
 
 @pytest.fixture(scope="module")
@@ -61,13 +69,42 @@ def test_profiles_are_not_shared_where_one_camera_does_not_suit(cameras, device)
     rig = rig_of(*cameras)
     assert not lfpiv.build_weights(rig, GRID).has_ray_rows
     stored = StoredGrid.for_cameras(GRID, rig.cameras.values(), columns_inmost=True)
-    assert choose_separable(stored, rig.cameras, np.inf, lambda part: None) is None
+    assert choose_separable(stored, rig.cameras, share_of(rig.cameras), np.inf, lambda part: None) is None
 
 
 def test_profiles_are_not_shared_beyond_the_memory_that_is_left(both):
     cameras = both[0].cameras
     stored = StoredGrid.for_cameras(GRID, cameras.values(), columns_inmost=True)
-    assert choose_separable(stored, cameras, 1e6, lambda part: None) is None
+    assert choose_separable(stored, cameras, share_of(cameras), 1e6, lambda part: None) is None
+
+
+def test_profiles_are_shared_only_where_a_gpu_holds_them(both, tmp_path, monkeypatch):
+    """What a GPU does not hold is stored in blocks, which can be streamed."""
+    shared, _ = both
+    cameras = shared.cameras
+    rig, beside = rig_of(*cameras.values()), beside_bytes(cameras.values(), GRID)
+    need = estimate_device_need(rig, GRID)
+    planes = [separable.Planes(shared.stored, one) for one in cameras.values()]
+    assert need.beside == beside and need.cameras == pytest.approx([one.device_bytes for one in planes], rel=0.05)
+    monkeypatch.setattr(runtime, "free_bytes", lambda: need.whole)
+    assert possible_planes(shared.stored, cameras, share_of(cameras)).keys() == cameras.keys()
+    monkeypatch.setattr(runtime, "free_bytes", lambda: need.whole - 20 * MIB)
+    assert possible_planes(shared.stored, cameras, share_of(cameras)) is None
+    assert estimate_device_need(rig, GRID).cameras != need.cameras
+    content = save_weights(shared, tmp_path / "weights")
+    monkeypatch.setattr(runtime, "free_bytes", lambda: beside + sum(need.cameras) // 4)
+    with pytest.raises(InputError, match=r"camera 'one' take .* of the GPU's memory, of which .* are left"):
+        open_weights(tmp_path / "weights", cameras, content)
+
+
+def test_memory_of_a_gpu_is_estimated(both):
+    shared, _ = both
+    if runtime.device().form != "gpu":
+        pytest.skip("the arrays of the CPU are those of the host")
+    for name, camera in shared.cameras.items():
+        estimate = separable.Planes(shared.stored, camera).device_bytes
+        found = shared.projector(name).device_bytes
+        assert (1 - TOLERANCE_ESTIMATE) * found < estimate < 1.5 * found  # levels that are 0 are left out
 
 
 def test_small_volumes_store_all_voxels(device):
