@@ -14,7 +14,7 @@ from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import WHOLE_PASSES, Partition, iterate_epochs
+from lfpiv.reconstruction.ordered_subsets import POINT_PASSES, WHOLE_PASSES, Partition, iterate_epochs
 from lfpiv.reconstruction.recording import Recording
 from lfpiv.reconstruction.resting_voxels import DARK, RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
@@ -47,14 +47,15 @@ class PreparedInstant:
         self,
         *,
         iterations: int | None = None,
-        whole_passes: int = WHOLE_PASSES,
+        whole_passes: int | None = None,
         first: np.ndarray | None = None,
         brief: bool = False,
         progress: Callable[[float], None] | None = None,
     ) -> Reconstruction:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
-        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes. A
+        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes;
+        default: `WHOLE_PASSES`, or `POINT_PASSES` after subsets of all cameras without a sieve. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
         misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
         where the first guess is that of the images. Another one shows where particles are: without a sieve, voxels that
@@ -69,6 +70,9 @@ class PreparedInstant:
         state = State(guess, momentum, normalisation.steps)
         count = settings.iterations if iterations is None else iterations
         history = History(settings, count)
+        if whole_passes is None:
+            points = normalisation.is_joint and normalisation.sieve.sigma_voxel == 0
+            whole_passes = POINT_PASSES if points else WHOLE_PASSES
         possible = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
         partitions = normalisation.partitions if possible else ()
         epochs = partitions[0].most_epochs(possible) if partitions else 0
@@ -77,7 +81,7 @@ class PreparedInstant:
             if partitions:
                 state, rose = self._solve_subsets(state, partitions, history, epochs, brief, first is None, progress)
             left = count - history.epochs
-            enough = bool(partitions) and partitions[0].is_joint and history.epochs < possible and not rose
+            enough = normalisation.is_joint and history.epochs < possible and not rose
             if enough:
                 left = min(left, whole_passes)
             if brief and left == 0:

@@ -81,12 +81,12 @@ class Normalisation:
     @property
     def sample(self) -> tuple[Subset, ...]:
         """Subsets by which guesses are compared: of each camera one, or some of all cameras. None without subsets."""
-        if self._is_joint:
+        if self.is_joint:
             return self._subsets[: -(-len(self._subsets) // COMPARED)]
         return tuple(subset for subset in self._subsets if subset.parts[0][1] != 1) if self.has_subsets else ()
 
     @property
-    def _is_joint(self) -> bool:
+    def is_joint(self) -> bool:
         """Whether each subset has rays of all cameras."""
         cameras = [camera for camera, _ in self._subsets[0].parts] if self.has_subsets else []
         return self._weights.has_ray_rows and len(set(cameras)) == len(self._weights.cameras)
@@ -133,7 +133,7 @@ class Normalisation:
     @cached_property
     def partitions(self) -> tuple[Partition, ...]:
         """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
-        if self._is_joint:
+        if self.is_joint:
             return (self._joint_partition(),)
         cameras = len(self._weights.cameras)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras

@@ -60,6 +60,8 @@ SUBSET_MOMENTUM = 0.94
 """Largest exponent of the momentum from subset to subset: a memory of four passes over four subsets."""
 WHOLE_PASSES = 2
 """Passes over all rays after the last epoch, at most half of all passes."""
+POINT_PASSES = 5
+"""The same after subsets of all cameras without a sieve, which are left early."""
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
 CONFLICT = 0.5
