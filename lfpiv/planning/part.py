@@ -30,12 +30,12 @@ from lfpiv.weights.blocks import (
     require_numbers,
     sample_blocks,
 )
-from lfpiv.weights.choice import Choice, choose_form, choose_uncounted
-from lfpiv.weights.counting import CountedVoxels
+from lfpiv.weights.choice import Choice, choose_forms
 from lfpiv.weights.depth_planes import NodeGrid, choose_planes, line_of_sight
 from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.operator import Weights, build_weights
-from lfpiv.weights.separable import Planes, choose_separable, possible_planes, ray_sets
+from lfpiv.weights.separable import choose_separable, possible_planes, ray_sets
+from lfpiv.weights.separable_planes import Planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import device_bytes
@@ -161,12 +161,7 @@ class Volume:
         if self.experiment.compute.weights == "count":
             counted = Choice(form="pixels")
             return {name: self._blocks_form(stored, camera, counted, None) for name, camera in self.cameras.items()}
-        wanted, choices = self.experiment.compute.weights_form, {}
-        for name, camera in self.cameras.items():
-            square = wanted == "auto" and camera.lattice.layout == "square"
-            choices[name] = (
-                choose_form(CountedVoxels(stored, camera)) if square else choose_uncounted(stored, camera, wanted)
-            )
+        choices, _ = choose_forms(stored, self.cameras, self.experiment.compute.weights_form)
         profiles = all(choice.form == "profiles" for choice in choices.values())
         if profiles and (shared := self._shared_profiles()) is not None:
             return {
@@ -178,17 +173,12 @@ class Volume:
                 )
                 for name, planes in shared.items()
             }
-        return {
-            name: self._blocks_form(
-                stored,
-                camera,
-                choices[name],
-                choose_planes(
-                    stored, camera, choices[name].form, choices[name].cuts, particle_voxel=self.particle_voxel
-                ),
-            )
-            for name, camera in self.cameras.items()
-        }
+        found = {}
+        for name, camera in self.cameras.items():
+            choice = choices[name]
+            nodes = choose_planes(stored, camera, choice.form, choice.cuts, particle_voxel=self.particle_voxel)
+            found[name] = self._blocks_form(stored, camera, choice, nodes)
+        return found
 
     def _shared_profiles(self) -> dict[str, Planes] | None:
         """Return the planes of voxels if they share profiles, as `build_weights` finds out.
@@ -231,24 +221,22 @@ class Volume:
         else:
             separable = all(form.separable for form in forms.values())
             stored = StoredGrid.for_cameras(grid, self.cameras.values(), columns_inmost=separable)
-            projectors: dict[str, RayProjector] = {}
-            for name, camera in self.cameras.items():
-                form = forms[name]
-                if separable:
-                    profiles = Planes(stored, camera).weights(_ignore)
-                    assert profiles is not None  # those of the whole volume were possible
-                    projectors[name] = SeparableProjector(profiles, ray_sets(self.cameras))
-                    continue
-                nodes = None
-                if form.distance is not None:
-                    nodes = NodeGrid.of(stored, camera, form.distance, lines=form.lines)
-                choice = form.choice
-                blocks = footprint_blocks(nodes or stored, camera, choice.form, _ignore, _ignore, choice.cuts)
-                projectors[name] = Projector(blocks, None if nodes is None else nodes.shares)
+            projectors = {name: self._projector(forms[name], stored, camera) for name, camera in self.cameras.items()}
             built = Weights(stored, self.cameras, projectors, "footprint")
         built.volume = self.experiment.grid
         _ = built.camera_sums
         return built
+
+    def _projector(self, form: Form, stored: StoredGrid, camera: CalibratedCamera) -> RayProjector:
+        """Build the weights of one camera on these voxels in a form."""
+        if form.separable:
+            profiles = Planes(stored, camera).weights(_ignore)
+            assert profiles is not None  # those of the whole volume were possible
+            return SeparableProjector(profiles, ray_sets(self.cameras))
+        nodes = None if form.distance is None else NodeGrid.of(stored, camera, form.distance, lines=form.lines)
+        choice = form.choice
+        blocks = footprint_blocks(nodes or stored, camera, choice.form, _ignore, _ignore, choice.cuts)
+        return Projector(blocks, None if nodes is None else nodes.shares)
 
     def per_voxel(self) -> float:
         """Return the number of particles per reconstructed voxel at which there are `PER_MICROLENS`."""

@@ -75,7 +75,7 @@ class PreparedInstant:
             whole_passes = POINT_PASSES if points else WHOLE_PASSES
         possible = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
         partitions = normalisation.partitions if possible else ()
-        epochs = partitions[0].most_epochs(possible) if partitions else 0
+        epochs = min(possible, partitions[0].most_epochs) if possible and normalisation.is_joint else possible
         rose = False
         with self.equations.locked():
             if partitions:

@@ -28,7 +28,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
 COMPARED = 4
-"""Each so-manieth subset of all cameras is one by which guesses are compared."""
+"""By a fourth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 
@@ -201,9 +201,8 @@ def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[
         q of each voxel.
     """
     names, count = list(weights.cameras), len(subsets)
-    light = np.zeros(count)
-    for number, subset in enumerate(subsets):
-        light[number] = sum(weights.light_of_sets(names[camera])[ray_set] for camera, ray_set in subset.parts)
+    of_sets = [weights.light_of_sets(name) for name in names]
+    light = np.array([sum(of_sets[camera][ray_set] for camera, ray_set in subset.parts) for subset in subsets])
     least = np.maximum(count * light / light.sum(), 1)
     excess = np.ones(weights.grid.size, np.float32)
     for subset, own in zip(subsets, least, strict=True):

@@ -16,11 +16,11 @@ particle, particles smaller than voxels. Each subset then undoes what the others
 single subsets. The exponents g_n of the subsets in an epoch show it. With <a, b> = sum_j c_j a_j b_j, the agreement
 |sum_n g_n|^2 / sum_n |g_n|^2 is N where all of N subsets ask for the same, 1 where their exponents are independent, and
 0 where they cancel. Below a limit larger subsets follow, or the passes over all rays. Stochastic gradient methods
-enlarge their samples by such a test of norms [3]_. Rows of all cameras bring particles out of the noise until they all
-but cancel (`JOINT_CONFLICT`). Volumes of points, without a sieve, follow the noise sooner (`POINT_CONFLICT`).
+enlarge their samples by such a test of norms [3]_. Subsets of all cameras improve the volume until their exponents
+nearly cancel (`JOINT_CONFLICT`). Without a sieve the volume begins to follow the noise earlier (`POINT_CONFLICT`).
 
-How far the solution is depends on the number of steps, whatever share of the rays each of them takes. So epochs of many
-subsets end after `MOST_STEPS` steps.
+The number of steps decides how near the volume comes to the solution. The share of the rays in each step hardly
+matters. So epochs of many subsets end after `MOST_STEPS` steps.
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
 rises, the epoch is undone, the momentum starts anew, and SMART's own steps follow (here divided by sums that are not
@@ -97,13 +97,9 @@ class Partition:
     """Agreement of the subsets below which they are left."""
 
     @property
-    def is_joint(self) -> bool:
-        """Whether each subset has rays of all cameras, and the passes over all rays follow."""
-        return bool(self.lengths)
-
-    def most_epochs(self, possible: int) -> int:
-        """Return the largest number of epochs, at most a possible one."""
-        return min(possible, -(-MOST_STEPS // len(self.subsets))) if self.is_joint else possible
+    def most_epochs(self) -> int:
+        """Number of epochs that make `MOST_STEPS` steps."""
+        return -(-MOST_STEPS // len(self.subsets))
 
 
 @dataclass(frozen=True)
@@ -156,7 +152,10 @@ def subsets_of(cameras: int, sets: int = 1) -> tuple[Subset, ...]:
 
 
 def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
-    """Return subsets, far ones after each other, each of some sets of the rays of all cameras."""
+    """Return subsets that each take some sets of the rays of all cameras.
+
+    Subsets whose rows lie far apart in the pupil follow each other.
+    """
     bits = max(count - 1, 1).bit_length()
     order = (int(f"{number:0{bits}b}"[::-1], 2) for number in range(1 << bits))
     return tuple(
@@ -245,7 +244,7 @@ def iterate_epochs(
         is_last = rose and not may_be_safer and not following
         yield Epoch(State(coefficients, momentum, state.steps), misfit, count, rose, undone=rose and not is_last)
         if is_last:
-            log.debug("epoch %d: misfit rises, passes over all rays follow", epoch + 1)
+            log.debug("epoch %d: misfit rises, whole passes follow", epoch + 1)
             return
         if rose and may_be_safer:
             log.debug("epoch %d: misfit rises, safer steps follow", epoch + 1)
@@ -254,7 +253,9 @@ def iterate_epochs(
         if not rose:
             before = misfit.divergence
         if rose or (agreement is not None and agreement.measured() < partition.conflict):
-            log.debug("epoch %d: %s, larger subsets follow", epoch + 1, "misfit rises" if rose else "subsets conflict")
-            if not following or len(following[0].subsets) == 1:
+            larger = bool(following) and len(following[0].subsets) > 1
+            why, what = "misfit rises" if rose else "subsets conflict", "larger subsets" if larger else "whole passes"
+            log.debug("epoch %d: %s, %s follow", epoch + 1, why, what)
+            if not larger:
                 return
             partition, before = following.pop(0), math.inf

@@ -49,10 +49,9 @@ FLOW_MEMORY = 0.7
 FIRST_SHARE = 0.35
 """Iterations of an instant that starts from its images, as a share of those of an instant by itself."""
 ITERATION_SHARE = 0.2
-"""The same of an instant that starts from the one before, where an iteration has up to `SHARE_SUBSETS` subsets. With
-more of them, fewer iterations make as many steps."""
+"""Iterations of an instant that starts from the one before, as a share of those of an instant by itself."""
 SHARE_SUBSETS = 4
-"""Subsets up to which `ITERATION_SHARE` holds."""
+"""Number of subsets up to which `ITERATION_SHARE` holds. With more subsets, fewer iterations make as many steps."""
 DIMMEST = 0.05
 """Least light of the moved volume in the first guess, as a share of the guess's mean."""
 FAINTEST = 1e-6
@@ -174,7 +173,9 @@ class SequenceSolver:
             if share == 1:
                 found = prepared.solve(progress=progress)
             else:
-                count = max(round(share * self.smart.settings.iterations), 1)
+                count = math.ceil(share * self.smart.settings.iterations)
+                if start is Start.PREDICTED:  # as many steps
+                    count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
                 found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=True, progress=progress)
             return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
 
@@ -192,8 +193,7 @@ class SequenceSolver:
             chance = prepared.sampled_misfit(_concentrated(exchanged, plain))
             if not misfit < LEAST_AGREEMENT * chance:
                 return solved(Start.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
-        share = ITERATION_SHARE * min(1, SHARE_SUBSETS / len(self.smart.subsets))
-        return solved(Start.PREDICTED, share, guess)
+        return solved(Start.PREDICTED, ITERATION_SHARE, guess)
 
     def correct(
         self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None

@@ -134,7 +134,7 @@ class SmartSolver:
         if wanted not in possible:
             numbers = ", ".join(map(str, possible))
             raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
-        return subsets_of(cameras, 2 if wanted == 2 * cameras else 1) if wanted > 1 else subsets_of(1)
+        return subsets_of(cameras, wanted // cameras) if wanted > 1 else subsets_of(1)
 
     def _sees_alone(self, name: str) -> bool:
         """Return whether most of a camera's pixels see a single set of rays, and each set has some."""

@@ -11,7 +11,8 @@ from lfpiv.weights.choice import form_errors, warn_of_errors
 from lfpiv.weights.depth_planes import choose_planes
 from lfpiv.weights.device_share import DeviceNeed, DeviceShare, beside_bytes, rays_bytes
 from lfpiv.weights.operator import Weights
-from lfpiv.weights.separable import Planes, possible_planes
+from lfpiv.weights.separable import possible_planes
+from lfpiv.weights.separable_planes import Planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector import Projector
@@ -50,13 +51,12 @@ def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto
 
 def _planes(calibration: Calibration, grid: Grid, form: str) -> dict[str, Planes] | None:
     """Return the planes of each camera whose profiles are shared, if these may suit."""
+    if form == "pixels":
+        return None
     runtime.device()
     cameras = calibration.cameras
-    return (
-        None
-        if form == "pixels"
-        else possible_planes(StoredGrid(grid, (0, 1, 2)), cameras, DeviceShare(cameras.values(), grid))
-    )
+    stored = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
+    return possible_planes(stored, cameras, DeviceShare(cameras.values(), grid))
 
 
 def _samples(

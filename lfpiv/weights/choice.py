@@ -9,7 +9,7 @@ must be cut if its edges lie oblique to the microlenses.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -58,6 +58,23 @@ class Choice:
     """Parts of a voxel along x, y, z, with the form "pixels"."""
     profile_errors: tuple[float, ...] | None = None
     """Relative L2 error of profiles per counted voxel. None if the form was not chosen by counted rays."""
+
+
+def choose_forms(
+    stored: StoredGrid, cameras: Mapping[str, CalibratedCamera], form: str
+) -> tuple[dict[str, Choice], dict[str, CountedVoxels]]:
+    """Choose the form of each camera's footprints; return the voxels, too, that were counted for it.
+
+    The form "auto" is chosen by counted rays where the microlenses are square.
+    """
+    choices, counted = {}, {}
+    for name, camera in cameras.items():
+        if form == "auto" and camera.lattice.layout == "square":
+            counted[name] = CountedVoxels(stored, camera)
+            choices[name] = choose_form(counted[name])
+        else:
+            choices[name] = choose_uncounted(stored, camera, form)
+    return choices, counted
 
 
 def choose_form(counted: CountedVoxels) -> Choice:

@@ -26,7 +26,7 @@ from lfpiv.settings.processing import Compute
 from lfpiv.weights.adjoint import Adjoint, checked_out
 from lfpiv.weights.blocks import Cuts, footprint_blocks
 from lfpiv.weights.card import card_of
-from lfpiv.weights.choice import Choice, choose_form, choose_uncounted, memory_check
+from lfpiv.weights.choice import Choice, choose_forms, memory_check
 from lfpiv.weights.counted_grid import count_blocks
 from lfpiv.weights.counting import CountedVoxels, add_entries
 from lfpiv.weights.depth_planes import choose_planes
@@ -93,7 +93,6 @@ class Weights(Shown):
         self._choices = dict(choices or {})
         self._counted = dict(counted or {})
         self._camera_sums = camera_sums
-        self._set_light: dict[str, np.ndarray] = {}
         self.volume = stored.grid
         """Voxels that users see, about which warnings are: without guard layers, perhaps larger; default: the grid."""
         self.derived: dict[tuple[Hashable, ...], Any] = {}
@@ -246,12 +245,10 @@ class Weights(Shown):
         -------
         ndarray, shape (set,), float64
         """
-        if name not in self._set_light:
-            projector, gain = self.projector(name), self.gain(name)
-            image = projector.project(np.ones(self.grid.size, np.float32), np.zeros_like(gain))
-            pixels = [projector.see_only(number) for number in range(projector.ray_sets)]
-            self._set_light[name] = np.array([(gain[own] * image[own]).sum(dtype=np.float64) for own in pixels])
-        return self._set_light[name]
+        projector, gain = self.projector(name), self.gain(name)
+        image = projector.project(np.ones(self.grid.size, np.float32), np.zeros_like(gain))
+        pixels = [projector.see_only(number) for number in range(projector.ray_sets)]
+        return np.array([(gain[own] * image[own]).sum(dtype=np.float64) for own in pixels])
 
     @property
     def column_sum(self) -> np.ndarray:
@@ -392,12 +389,8 @@ def build_weights(
     share = DeviceShare(cameras.values(), grid)
     projectors, choices, counted = dict[str, RayProjector](), dict[str, Choice](), dict[str, CountedVoxels]()
     whole = progress or (lambda fraction: None)
-    for name, camera in cameras.items() if method == "footprint" else ():
-        if form == "auto" and camera.lattice.layout == "square":
-            counted[name] = CountedVoxels(stored, camera)
-            choices[name] = choose_form(counted[name])
-        else:
-            choices[name] = choose_uncounted(stored, camera, form)
+    if method == "footprint":
+        choices, counted = choose_forms(stored, cameras, form)
     if planes and choices and all(choice.form == "profiles" for choice in choices.values()):
         columns_inmost = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
         separable = choose_separable(columns_inmost, cameras, share, limit_bytes, whole)

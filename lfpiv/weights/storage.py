@@ -86,8 +86,8 @@ def save_weights(weights: Weights, folder: Path) -> str:
             "method": weights.method,
             "camera_sums": put("camera_sums", weights.camera_sums),
             "cameras": {
-                name: [kind.__name__, *(put(f"camera{number}.{k}", part) for k, part in enumerate(parts))]
-                for number, (name, (kind, *parts)) in enumerate(stored.items())
+                name: [type(parts[0]).__name__, *(put(f"camera{number}.{k}", part) for k, part in enumerate(parts))]
+                for number, (name, parts) in enumerate(stored.items())
             },
         }
         content = digest.hexdigest()
@@ -128,14 +128,13 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         camera_sums = _map(folder, header["camera_sums"], arrays)
         parts: dict[str, list[Any]] = {}
         for name, (kind, *entries) in header["cameras"].items():
-            kinds = next(kinds for kinds in _STORED if kinds[0].__name__ == kind)
             parts[name] = [
                 None if entry is None else _take(one, folder, entry, arrays)
-                for one, entry in zip(kinds, entries, strict=True)
+                for one, entry in zip(_STORED[kind], entries, strict=True)
             ]
         if content not in (None, _content(arrays)):
             raise ValueError("weights of another run")
-    except (OSError, ValueError, KeyError, TypeError, StopIteration, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
     share, sets = DeviceShare(cameras.values(), grid), ray_sets(cameras)
@@ -146,16 +145,16 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
 
 
-_STORED: tuple[tuple[type, ...], ...] = ((Blocks, PlaneShares), (SeparableWeights,))
-"""What is stored of a camera's weights, by the type of the first part."""
+_STORED: dict[str, tuple[type, ...]] = {"Blocks": (Blocks, PlaneShares), "SeparableWeights": (SeparableWeights,)}
+"""Types of what is stored of a camera's weights, by the name of the first one."""
 
 
 def _parts_of(projector: RayProjector) -> list[Any]:
-    """Return the type by which the weights of a projector are known, and what is stored of them."""
+    """Return what is stored of the weights of a projector."""
     if isinstance(projector, SeparableProjector):
-        return [SeparableWeights, projector.weights]
+        return [projector.weights]
     assert isinstance(projector, Projector)
-    return [Blocks, projector.blocks, projector.planes]
+    return [projector.blocks, projector.planes]
 
 
 def _content(arrays: Mapping[str, np.ndarray]) -> str:

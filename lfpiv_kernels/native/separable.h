@@ -112,9 +112,6 @@ LFPIV_INLINE Lane load_voxels(const float* from, int count) {
     return lanes;
 }
 
-/// Return the floats of a line with its margins.
-LFPIV_INLINE int line_size(const SeparableArrays& in) { return (in.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP; }
-
 /// Columns of a plane, whole blocks of them.
 struct ColumnBlocks {
     int begin, end;
@@ -255,53 +252,20 @@ LFPIV_INLINE void gather_across(const float* rays, const short* first, const flo
     }
 }
 
-/// Call work.template operator()<TAPS>() with the number of taps.
-template <class Work>
-LFPIV_INLINE void with_taps(int taps, Work work) {
-    switch (taps) {
-#define LFPIV_CASE(N)          \
-    case N:                    \
-        work.template of<N>(); \
-        break;
-        LFPIV_CASE(1)
-        LFPIV_CASE(2)
-        LFPIV_CASE(3)
-        LFPIV_CASE(4)
-        LFPIV_CASE(5)
-        LFPIV_CASE(6)
-        LFPIV_CASE(7)
-        LFPIV_CASE(8)
-        LFPIV_CASE(10)
-        LFPIV_CASE(12)
-        LFPIV_CASE(16)
-#undef LFPIV_CASE
-        default:
-            break;
-    }
-}
+/// A number that is known to the compiler.
+template <int N>
+struct Number {
+    static constexpr int value = N;
+};
 
-struct AddAcross {
-    const float* line;
-    const short* first;
-    const float* value;
-    int pixels;
-    float* out;
-    template <int TAPS>
-    LFPIV_INLINE void of() const {
-        add_across<TAPS>(line, first, value, pixels, out);
-    }
-};
-struct GatherAcross {
-    const float* rays;
-    const short* first;
-    const float* value;
-    int pixels;
-    float* line;
-    template <int TAPS>
-    LFPIV_INLINE void of() const {
-        gather_across<TAPS>(rays, first, value, pixels, line);
-    }
-};
+/// Call work(Number<taps>{}) with the number of taps, from 1 to `MOST_TAPS`.
+template <int N = 1, class Work>
+LFPIV_INLINE void with_taps(int taps, Work work) {
+    if (taps == N)
+        work(Number<N>{});
+    else if constexpr (N < MOST_TAPS)
+        with_taps<N + 1>(taps, work);
+}
 
 /// Return a ray's rim.
 LFPIV_INLINE Lane rim_of(const signed char* rim) {
@@ -332,9 +296,11 @@ LFPIV_INLINE void project_segment(const SeparableArrays& in, const float* volume
             const Across across(in, plane, strip);
             const float* const line = lines + (int64_t)plane * size;
             const int from = max(block, across.lens), to = min(last, across.lens + across.count);
-            for (int i = from; i < to; ++i)
-                with_taps(across.taps, AddAcross{line, across.first_of(i), across.values_of(i, values), in.pixels,
-                                                 out + (i - block) * lens_rays});
+            with_taps(across.taps, [&](auto taps) {
+                for (int i = from; i < to; ++i)
+                    add_across<taps.value>(line, across.first_of(i), across.values_of(i, values), in.pixels,
+                                           out + (i - block) * lens_rays);
+            });
         }
         const signed char* rim = in.rim + (start + block) * lens_rays;
         for (int i = block; i < last; ++i, rim += lens_rays) {  // the middle of what lies inside the pupil
@@ -373,11 +339,12 @@ LFPIV_INLINE void gather_plane(const SeparableArrays& in, const float* rays, int
         if (across.count == 0) continue;
         for (int k = 0; k < line_size(in); k += STRIP) store(line + k, Lane{});
         int low = in.columns, high = 0;
-        for (int i = across.lens; i < across.lens + across.count; ++i) {
-            const float* const from = rays + ((int64_t)strip * in.lenses + i) * lens_rays;
-            with_taps(across.taps,
-                      GatherAcross{from, across.first_of(i), across.values_of(i, values), in.pixels, line});
-        }
+        with_taps(across.taps, [&](auto taps) {
+            for (int i = across.lens; i < across.lens + across.count; ++i) {
+                const float* const from = rays + ((int64_t)strip * in.lenses + i) * lens_rays;
+                gather_across<taps.value>(from, across.first_of(i), across.values_of(i, values), in.pixels, line);
+            }
+        });
         across.widen(across.lens, low, high), across.widen(across.lens + across.count - 1, low, high);
         return_line(in, plane, ray_row, strip, ColumnBlocks(in, low, min(high, in.columns)), line, volume_out);
     }

@@ -22,12 +22,9 @@ LFPIV_INLINE RayRows ray_rows(const Rows& rows) {
     return {rows.first, rows.step, rows.count};
 }
 
-/// Return the columns of a line in memory. Those behind the last block stay dark.
-LFPIV_INLINE int line_columns(const SeparableArrays& in) { return in.blocks * COLUMN_BLOCK + MOST_TAPS; }
-
 /// Return where a line of the n-th ray row begins; it is that of a plane and strip: plane * strips + strip.
 LFPIV_INLINE int64_t line_place(const SeparableArrays& in, int n, int line) {
-    return ((int64_t)n * in.planes * in.strips + line) * line_columns(in) * STRIP;
+    return ((int64_t)n * in.planes * in.strips + line) * line_size(in);
 }
 
 /// One lens row at one column of a line, which lies at `place`.

@@ -85,6 +85,9 @@ LFPIV_INLINE SeparableArrays separable_arrays(const Arrays& in) {
             in.seen_level.data};
 }
 
+/// Return the floats of a line. Columns behind the last block stay dark.
+LFPIV_INLINE int line_size(const SeparableArrays& in) { return (in.blocks * COLUMN_BLOCK + MOST_TAPS) * STRIP; }
+
 }  // namespace lfpiv
 
 #endif

@@ -37,6 +37,13 @@ struct RayLayout {
     }
 };
 
+/// Return the layout from Warp's structs.
+template <class Inputs, class Layout>
+LFPIV_INLINE RayLayout ray_layout(const Inputs& inputs, const Layout& rays) {
+    return {weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
+            rays.pixels,           rays.ray_rows};
+}
+
 /// Return the middle, counted from the pupil's centre, of a row of pixels' part inside the pupil; `y` is the middle of
 /// the row. All in pixels.
 LFPIV_INLINE float middle_of_row(float y, float radius) {
@@ -164,13 +171,11 @@ LFPIV_INLINE void fill_down(const RayLayout& rays, const PlaneOfVoxels& plane, i
 
 /// Find the profiles across of the columns of a plane for one strip, whose ray models lie on the middle row of lenses
 /// of each part. Write the first lens and the number of lenses, the number of taps, then `first` of each lens and
-/// pixel, which must hold -1, and the values, `MOST_TAPS` to a pixel and part. Return whether there is room for all
-/// taps.
-LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, float least, int* lens_out,
+/// pixel, which must hold -1, and the values, `MOST_TAPS` to a pixel and part. Values of further taps are left out.
+LFPIV_INLINE void find_across(const RayLayout& rays, int strip, int columns, float least, int* lens_out,
                               short* first_out, float* value_out) {
     const Geometry& g = *rays.in.geometry;
     int low = rays.lenses, high = -1, taps = 0;
-    bool room = true;
     for (int at_column = 0; at_column < columns * PARTS; ++at_column) {
         const int column = at_column / PARTS, part = at_column % PARTS;
         const float j = (float)(rays.in.first_j + strip * STRIP + part * (STRIP / PARTS)) + 0.5f * (STRIP / PARTS - 1);
@@ -201,18 +206,14 @@ LFPIV_INLINE bool find_across(const RayLayout& rays, int strip, int columns, flo
                 const int at = lens * rays.pixels + pixel;
                 if (first_out[at] < 0) first_out[at] = (short)column;
                 const int tap = column - first_out[at];
-                if (tap >= MOST_TAPS) {
-                    room = false;
-                    continue;
-                }
-                value_out[((int64_t)at * MOST_TAPS + tap) * PARTS + part] = value;
                 taps = max(taps, tap + 1);
+                if (tap >= MOST_TAPS) continue;
+                value_out[((int64_t)at * MOST_TAPS + tap) * PARTS + part] = value;
                 low = min(low, lens), high = max(high, lens);
             }
         }
     }
     lens_out[0] = low, lens_out[1] = max(high - low + 1, 0), lens_out[2] = taps;
-    return room;
 }
 
 /// Write the pixel, the share and the rim of the rays of one lens in one ray row of a strip.

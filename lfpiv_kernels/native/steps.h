@@ -85,15 +85,26 @@ LFPIV_INLINE float times_exponential(float light, float x) {
     return light * power(first, exponent.rest) * power(min(max(exponent.whole - first, -125), 125), 0.0f);
 }
 
+/// A normal number x > 0 as 2^exponent * value, with a value from 0.7 to 1.4.
+struct Binary {
+    int exponent;
+    float value;
+
+    LFPIV_INLINE explicit Binary(float x) {
+        Bits mantissa;
+        mantissa.value = x;
+        exponent = (mantissa.bits - 0x3f3504f3) >> 23;
+        mantissa.bits -= exponent << 23;
+        value = mantissa.value;
+    }
+};
+
 /// Return log2(x) for a normal number x > 0; error 4e-8 and roundings.
 LFPIV_INLINE float log2_of(float x) {
     LFPIV_FUSED
-    Bits mantissa;
-    mantissa.value = x;
-    const int whole = (mantissa.bits - 0x3f3504f3) >> 23;
-    mantissa.bits -= whole << 23;
-    const float t = (mantissa.value - 1.0f) / (mantissa.value + 1.0f), t2 = t * t;  // 2 artanh(t) / log(2)
-    return (float)whole + t * (2.8853912f + t2 * (0.96147080f + t2 * 0.59897390f));
+    const Binary binary(x);
+    const float t = (binary.value - 1.0f) / (binary.value + 1.0f), t2 = t * t;  // 2 artanh(t) / log(2)
+    return (float)binary.exponent + t * (2.8853912f + t2 * (0.96147080f + t2 * 0.59897390f));
 }
 
 /// Return light * (light / last)^exponent, at least `SMALLEST`; zeros of `last` stay zero.

@@ -27,14 +27,9 @@ LFPIV_INLINE Misfit compare_pixel(float counts, float gain, float floor, float p
     const float infinite = (float)INFINITY;
     const float light = gain * projected, difference = counts - light, below = light + floor;
     const float excess = difference / below, quotient = (counts + floor) / below;
-    union {
-        float value;
-        int bits;
-    } mantissa;
-    mantissa.value = quotient;
-    const int exponent = (mantissa.bits - 0x3f3504f3) >> 23;
-    mantissa.bits -= exponent << 23;
-    const float t = (exponent ? mantissa.value - 1.0f : excess) / (mantissa.value + 1.0f), t2 = t * t;
+    const Binary binary(quotient);
+    const int exponent = binary.exponent;
+    const float t = (exponent ? binary.value - 1.0f : excess) / (binary.value + 1.0f), t2 = t * t;
     const float rest = t * t2 * (0.6666667f + t2 * (0.4f + t2 * (0.2857143f + t2 * 0.2222222f)));
     float logarithm = 0.6931472f * (float)exponent + (2.0f * t + rest);
     logarithm = quotient > 0.0f ? logarithm : -infinite;

@@ -18,7 +18,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.separable_gpu import LinesProjector
 from lfpiv_kernels.reconstruction.separable_layout import Separable, on_device
-from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, MOST_TAPS, STRIP, SeparableWeights
+from lfpiv_kernels.reconstruction.separable_weights import SeparableWeights, line_elements
 from lfpiv_kernels.transfer import Given, Values, empty, overwrite, to_device, to_host, zeros
 
 wp.set_module_options(native.options("separable.h", contract="fast"))
@@ -141,8 +141,6 @@ class SeparableProjector(RayProjector):
         Number of sets of rays.
     """
 
-    planes = None
-    streamed = None
     rests = False
     takes_rows = True
 
@@ -157,7 +155,7 @@ class SeparableProjector(RayProjector):
             _, planes, columns = weights.shape
             self._moved = weights.axes[2] != 2
             """Whether columns must be brought together in memory first."""
-            self._arrays = self._on_cpu(weights)
+            self._arrays = self._arrays_of(weights)
             self._turned = empty(weights.rays_of_row)
             self._lines = zeros(lines_bytes(planes, columns) // 4)
         self.map = self._map_rays()
@@ -172,7 +170,7 @@ class SeparableProjector(RayProjector):
         """Memory of a GPU that the weights and the loops take, beside `rays` [byte]; 0 on the CPU."""
         return 0 if self._on_gpu is None else self._on_gpu.nbytes + self.returned.size * 4
 
-    def _on_cpu(self, weights: SeparableWeights) -> Separable:
+    def _arrays_of(self, weights: SeparableWeights) -> Separable:
         """Return the arrays of weights for the CPU's kernels."""
         _, planes, columns = weights.shape
         return on_device(weights, (planes * columns, columns, 1) if self._moved else weights.strides)
@@ -269,7 +267,7 @@ class SeparableProjector(RayProjector):
         )
         with self.reserved():
             seen = to_device((weights.share > 0).astype(np.float32))
-            count = self._gather(self._on_cpu(lit), seen, ALL, zeros(int(np.prod(weights.voxels))))
+            count = self._gather(self._arrays_of(lit), seen, ALL, zeros(int(np.prod(weights.voxels))))
         return np.rint(to_host(count)).astype(np.int32)
 
     def largest_weight(self) -> float:
@@ -279,7 +277,7 @@ class SeparableProjector(RayProjector):
 
 def lines_bytes(planes: int, columns: int) -> int:
     """Return the memory of the lines that the threads of a launch work on [byte]."""
-    return 4 * runtime.CHUNKS * planes * (-(-columns // COLUMN_BLOCK) * COLUMN_BLOCK + MOST_TAPS) * STRIP
+    return 4 * runtime.CHUNKS * line_elements(planes, columns)
 
 
 def _transposed(volume: wp.array, shape: tuple[int, int, int], axes: tuple[int, int, int]) -> wp.array:

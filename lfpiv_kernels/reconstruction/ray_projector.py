@@ -81,7 +81,7 @@ class RayProjector:
         raise NotImplementedError
 
     def darken(self, ray_set: int = ALL) -> None:
-        """Make rays of a set dark that the map to pixels does not write."""
+        """Set rays of a set to zero where the map from pixels writes none."""
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""

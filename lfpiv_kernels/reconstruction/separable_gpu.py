@@ -17,7 +17,14 @@ from lfpiv_kernels import native
 from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction.separable_layout import Separable, on_device
-from lfpiv_kernels.reconstruction.separable_weights import COLUMN_BLOCK, MOST_TAPS, PARTS, STRIP, SeparableWeights
+from lfpiv_kernels.reconstruction.separable_weights import (
+    COLUMN_BLOCK,
+    MOST_TAPS,
+    PARTS,
+    STRIP,
+    SeparableWeights,
+    line_elements,
+)
 from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
 
 wp.set_module_options(native.options("separable_gpu.h", contract="fast"))
@@ -323,11 +330,6 @@ def columns_seen(weights: SeparableWeights) -> tuple[np.ndarray, np.ndarray, np.
         by.append(matrix.indices[:end] + int(weights.lens[plane, strip]) * weights.pixels)
         level.append(matrix.data[:end].view(np.uint8))
     return np.concatenate(start), np.concatenate(by).astype(np.int32), np.concatenate(level)
-
-
-def line_elements(lines: int, columns: int) -> int:
-    """Return the number of elements of the lines of a ray row, with those that stay dark."""
-    return lines * (-(-columns // COLUMN_BLOCK) * COLUMN_BLOCK + MOST_TAPS) * STRIP
 
 
 def rows_at_once(lines: tuple[int, int], ray_rows: int) -> int:

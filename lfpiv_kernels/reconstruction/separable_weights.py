@@ -25,29 +25,27 @@ class SeparableWeights:
 
     The weight of voxel (row b, plane p, column a) on the ray in pixel column c under lens (i, j), in ray row r, is the
     profile down ``D[p, r, j, a][b]`` times the profile across ``A[p, strip, i, c][a]``: rank 1 for each plane, ray row
-    and lens row. Across depends on the strip only: what differs from lens row to lens row within it moves the light
-    along the columns, by `turn`. A ray whose pixel is cut by the pupil's edge sees its middle inside: it takes `rim`
-    times the difference of its neighbours.
+    and lens row. Profiles across depend on the strip only. Within a strip the light moves along the columns from one
+    lens row to the next, by `turn`. The pupil's edge cuts some pixels. The part of such a pixel inside the pupil has
+    its middle nearer to the pupil's centre: `rim` times the difference of the neighbouring rays is added to its ray.
     """
 
     voxels: tuple[int, int, int]
     """Voxels along the axes in memory."""
     axes: tuple[int, int, int]
     """Axes in memory that count rows, planes and columns."""
-    first_lens: tuple[int, int]
-    """Lattice indices (i, j) of the first lens."""
     sensor_shape: tuple[int, int]
     """Rows and columns of the sensor [pixel]."""
     ray_rows: int
     """Rows of pixels under a lens."""
-    first_column: np.ndarray
-    """First pixel column of each lens, shape (strip, lens), int32."""
-    first_row: np.ndarray
-    """First pixel row of each row of lenses, in their order, shape (STRIP * strip,), int32."""
+    strips: int
+    """Strips of lenses."""
+    lenses: int
+    """Lenses in a row."""
     pixels: int
     """Columns of pixels under a lens."""
     middle: np.ndarray
-    """Pixel row of the microimages' centres, from `first_row` on, lane by lane, shape (STRIP * strip,), float32."""
+    """Ray row of the microimages' centres, a fraction, lane by lane, shape (STRIP * strip,), float32."""
     down_first: np.ndarray
     """First row of voxels of each profile down, shape (plane, ray row, strip, block, STRIP), int16; -1 for none."""
     down: np.ndarray
@@ -98,16 +96,6 @@ class SeparableWeights:
         return rows, planes, columns
 
     @property
-    def strips(self) -> int:
-        """Number of strips of lenses."""
-        return int(self.first_column.shape[0])
-
-    @property
-    def lenses(self) -> int:
-        """Number of lenses in a row."""
-        return int(self.first_column.shape[1])
-
-    @property
     def blocks(self) -> int:
         """Blocks of columns of a plane."""
         return -(-self.shape[2] // COLUMN_BLOCK)
@@ -135,3 +123,8 @@ class SeparableWeights:
             )
             best = max(best, scale * float(down) * float(level))
         return best
+
+
+def line_elements(lines: int, columns: int) -> int:
+    """Return the number of elements of some lines of planes with so many columns, margins that stay dark included."""
+    return lines * (-(-columns // COLUMN_BLOCK) * COLUMN_BLOCK + MOST_TAPS) * STRIP

@@ -3,8 +3,8 @@
 The weight of a voxel on a ray is integrated as in ``footprint``, along the two axes of the lenses apart. Where a
 camera's rays are straight, its lenses square and its array upright, the profile along the rows of the sensor is the
 same for all lenses of a row, and that along the columns the same for all voxels that one row of rays sees in a column.
-So a plane has few different profiles [1]_. The loops are C++, see ``separable_weights.h``. Twin:
-``reference.separable``.
+So a plane has few different profiles [1]_. The loops are C++, see ``separable_weights.h``. Tests compare the images of
+particles with those by ``footprint``, whose twin is ``reference.footprint``.
 
 .. [1] Y. Long, J. A. Fessler, J. M. Balter, "3D forward and back-projection for X-ray CT using separable footprints",
    IEEE Trans. Med. Imaging 29 (2010) 1839-1850, doi:10.1109/TMI.2010.2050898.
@@ -25,8 +25,6 @@ from lfpiv_kernels.weights.ray_model import LEVELS
 
 wp.set_module_options(native.options("separable_weights.h", contract="fast"))
 
-COMPILED_TAPS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16)
-"""Numbers of columns for which there are loops, see ``with_taps``."""
 LEAST = 0.5 / LEVELS
 """Least value of a profile across that is stored. A ray that sees nothing but a voxel has 1."""
 
@@ -44,10 +42,7 @@ class RayLayout:
 
 
 @wp.func_native("""
-    top_out.data[block] = lfpiv::top_of_block(
-        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
-         rays.pixels, rays.ray_rows},
-        {rows, columns, blocks}, block);
+    top_out.data[block] = lfpiv::top_of_block(lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block);
 """)
 def _top_of_block(
     inputs: Inputs, rays: RayLayout, rows: int, columns: int, blocks: int, block: int, top_out: wp.array(dtype=float)
@@ -56,9 +51,8 @@ def _top_of_block(
 
 @wp.func_native("""
     lfpiv::measure_down(
-        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
-         rays.pixels, rays.ray_rows},
-        {rows, columns, blocks}, block, per_level, (short*)first_out.data, (short*)last_out.data);
+        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, (short*)first_out.data,
+        (short*)last_out.data);
 """)
 def _measure_block(
     inputs: Inputs,
@@ -75,9 +69,8 @@ def _measure_block(
 
 @wp.func_native("""
     lfpiv::fill_down(
-        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
-         rays.pixels, rays.ray_rows},
-        {rows, columns, blocks}, block, per_level, taps, (const short*)first.data, level_out.data);
+        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, taps, (const short*)first.data,
+        level_out.data);
 """)
 def _fill_block(
     inputs: Inputs,
@@ -95,12 +88,9 @@ def _fill_block(
 
 @wp.func_native("""
     const int64_t lenses = (int64_t)strip * rays.lenses * rays.pixels;
-    if (!lfpiv::find_across(
-            {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
-             rays.pixels, rays.ray_rows},
-            strip, columns, least, lens_out.data + 3 * strip, (short*)first_out.data + lenses,
-            value_out.data + lenses * lfpiv::MOST_TAPS * lfpiv::PARTS))
-        lens_out.data[3 * strip + 2] = lfpiv::MOST_TAPS + 1;
+    lfpiv::find_across(
+        lfpiv::ray_layout(inputs, rays), strip, columns, least, lens_out.data + 3 * strip,
+        (short*)first_out.data + lenses, value_out.data + lenses * lfpiv::MOST_TAPS * lfpiv::PARTS);
 """)
 def _across_strip(
     inputs: Inputs,
@@ -118,9 +108,8 @@ def _across_strip(
     const int strip = at / rays.lenses % rays.strips, lens = at % rays.lenses, row = at / (rays.lenses * rays.strips);
     const int64_t ray = (int64_t)at * rays.pixels * lfpiv::STRIP;
     lfpiv::write_ray_row(
-        {lfpiv::weight_inputs(inputs), rays.first_column.data, rays.first_row.data, rays.strips, rays.lenses,
-         rays.pixels, rays.ray_rows},
-        row, strip, lens, pixel_out.data + ray, share_out.data + ray, (signed char*)rim_out.data + ray);
+        lfpiv::ray_layout(inputs, rays), row, strip, lens, pixel_out.data + ray, share_out.data + ray,
+        (signed char*)rim_out.data + ray);
 """)
 def _write_rays_of(
     inputs: Inputs,
@@ -328,7 +317,6 @@ class Profiles:
         for number, (low, count, taps) in enumerate(lens.tolist()):
             if taps > MOST_TAPS:
                 return None
-            taps = min((one for one in COMPILED_TAPS if one >= taps), default=taps) if count else 0
             lens[number] = low if count else 0, count, taps
             some = slice(low, low + count)
             columns_of.append(_within(first[number, some]))
@@ -354,11 +342,6 @@ class PlaneProfiles:
     """Of each strip first columns, shape (lens, pixel), int16."""
     level: list[np.ndarray]
     """Of each strip levels, shape (lens, pixel, tap, PARTS), uint8."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays [byte]."""
-        return self.down_first.nbytes + self.down.nbytes + sum(one.nbytes for one in (*self.first, *self.level))
 
     @staticmethod
     def joined(planes: "Sequence[PlaneProfiles]") -> dict[str, np.ndarray]:
@@ -387,13 +370,12 @@ class PlaneProfiles:
 
 
 def _within(first):
-    """Return first columns, with those of the nearest pixel where there are none."""
-    filled = first.copy()
-    for pixels in filled:  # a pixel without light sees the columns of its neighbour
-        known = np.flatnonzero(pixels >= 0)
-        if len(known):
-            pixels[:] = pixels[known[np.abs(np.arange(len(pixels))[:, None] - known).argmin(1)]]
-    return np.maximum(filled, 0)
+    """Return first columns (lens, pixel), where there are none those of the nearest pixel of the lens, or 0."""
+    pixel, last = np.arange(first.shape[1]), first.shape[1] - 1
+    before = np.maximum.accumulate(np.where(first >= 0, pixel, -len(pixel)), axis=1)
+    behind = np.minimum.accumulate(np.where(first >= 0, pixel, 2 * len(pixel))[:, ::-1], axis=1)[:, ::-1]
+    nearest = np.clip(np.where(pixel - before <= behind - pixel, before, behind), 0, last)
+    return np.maximum(np.take_along_axis(first, nearest, axis=1), 0)
 
 
 def _on_cpu(array):

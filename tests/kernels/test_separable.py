@@ -5,7 +5,7 @@ import pytest
 from support.ideal_rig import IdealCamera, lattice, optics, rotation
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.separable import Planes
+from lfpiv.weights.separable_planes import Planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference
 from lfpiv_kernels.reconstruction import separable_gpu

@@ -10,6 +10,7 @@ from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.files import MIB
+from lfpiv.lightfield.microimage_layout import microimage_centres
 from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
@@ -18,11 +19,13 @@ from lfpiv.weights.checks import compare_with_count, estimate_device_need, estim
 from lfpiv.weights.depth_planes import PARTICLE_ERROR, WORST_PARTICLE_ERROR, Sample, blobs_about
 from lfpiv.weights.device_share import DeviceShare, beside_bytes
 from lfpiv.weights.separable import choose_separable, particle_errors, possible_planes, ray_sets
+from lfpiv.weights.separable_planes import Planes
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
+from lfpiv_kernels.reconstruction.separable_weights import STRIP
 
 TOLERANCE_SUMS = 0.02
 """Sums of the weights of voxels that are wholly seen, as a part: profiles have 8 bits and are the same for a plane."""
@@ -84,7 +87,7 @@ def test_profiles_are_shared_only_where_a_gpu_holds_them(both, tmp_path, monkeyp
     cameras = shared.cameras
     rig, beside = rig_of(*cameras.values()), beside_bytes(cameras.values(), GRID)
     need = estimate_device_need(rig, GRID)
-    planes = [separable.Planes(shared.stored, one) for one in cameras.values()]
+    planes = [Planes(shared.stored, one) for one in cameras.values()]
     assert need.beside == beside and need.cameras == pytest.approx([one.device_bytes for one in planes], rel=0.05)
     monkeypatch.setattr(runtime, "free_bytes", lambda: need.whole)
     assert possible_planes(shared.stored, cameras, share_of(cameras)).keys() == cameras.keys()
@@ -102,7 +105,7 @@ def test_memory_of_a_gpu_is_estimated(both):
     if runtime.device().form != "gpu":
         pytest.skip("the arrays of the CPU are those of the host")
     for name, camera in shared.cameras.items():
-        estimate = separable.Planes(shared.stored, camera).device_bytes
+        estimate = Planes(shared.stored, camera).device_bytes
         found = shared.projector(name).device_bytes
         assert (1 - TOLERANCE_ESTIMATE) * found < estimate < 1.5 * found  # levels that are 0 are left out
 
@@ -208,7 +211,7 @@ def test_memory_is_estimated(both):
     shared = both[0]
     rays = sum(8 * one.rays.size + one.weights.pixel.nbytes for one in map(shared.projector, shared.cameras))
     estimate = estimate_memory(rig_of(*shared.cameras.values()), GRID)
-    planes = [separable.Planes(shared.stored, one) for one in shared.cameras.values()]
+    planes = [Planes(shared.stored, one) for one in shared.cameras.values()]
     assert sum(one.stored_bytes for one in planes) == pytest.approx(shared.memory_bytes, rel=TOLERANCE_ESTIMATE)
     assert estimate > shared.memory_bytes + rays
 
@@ -242,8 +245,8 @@ def test_profiles_serve_up_to_the_edges_of_the_sensor(yaw_deg, pitch_deg, roll_d
     seen = IdealCamera("one", rotation(yaw_deg, pitch_deg, roll_deg), optics(420, 460), lattice(roll_deg=0.05))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.6, 2.6, 2.6), voxel_mm=0.074)
     stored = StoredGrid.for_cameras(grid, [seen], columns_inmost=True)
-    weights = separable.Planes(stored, seen).weights(lambda part: None)
-    rows = separable.microimage_centres(seen.optics, seen.lattice, 0)[1].shape[0]
-    assert 0 < rows % separable.STRIP < 12
+    weights = Planes(stored, seen).weights(lambda part: None)
+    rows = microimage_centres(seen.optics, seen.lattice, 0)[1].shape[0]
+    assert 0 < rows % STRIP < 12
     errors = particle_errors(stored, seen, SeparableProjector(weights, 8))
     assert np.sqrt(np.mean(np.square(errors))) < PARTICLE_ERROR / 2 and max(errors) < WORST_PARTICLE_ERROR
