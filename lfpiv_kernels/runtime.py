@@ -11,7 +11,7 @@ import os
 import platform
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -257,10 +257,18 @@ def run_chunks(
         return
     edges = [size * part // chunks for part in range(chunks + 1)]
     parts = [(part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]]
-    if where.threads == 1:  # another thread would cost time and bring none
-        for part in parts:
+    waiting = iter(parts)
+
+    def work() -> None:
+        for part in waiting:
             job(*part)
-        return
-    futures = [_pool.submit(job, *part) for part in parts]
-    for future in futures:
-        future.result()
+
+    # The calling thread works, too. It wakes one thread for each other core: to hand over each part costs more time.
+    helpers = [_pool.submit(work) for _ in range(min(where.threads, len(parts)) - 1)]
+    try:
+        work()
+    finally:
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()

@@ -328,25 +328,31 @@ LFPIV_INLINE void turn_back_rim(const SeparableArrays& in, int64_t lens, const f
     }
 }
 
-/// Add the weighted sum of the light of a ray row to the voxels of one plane. `rays` are those of this ray row, with
-/// the rim turned back; `line` is memory of one line.
-LFPIV_INLINE void gather_plane(const SeparableArrays& in, const float* rays, int ray_row, int plane, float* line,
+/// Add the weighted sum of the light of rays to the voxels of one plane. `turned` are the rays of some ray rows and
+/// strips with the rim turned back: rays[row][strip][lens][pixel column][lens row]. `line` is memory of one line. All
+/// rows of a strip follow each other, so that the voxels that it sees stay in the caches.
+template <class Part>
+LFPIV_INLINE void gather_plane(const SeparableArrays& in, const float* turned, const Part& part, int plane, float* line,
                                float* volume_out) {
     const int64_t lens_rays = (int64_t)in.pixels * STRIP;
     float values[MOST_VALUES];
-    for (int strip = 0; strip < in.strips; ++strip) {
+    for (int k = 0; k < part.strips; ++k) {
+        const int strip = part.first_strip + k;
         const Across across(in, plane, strip);
         if (across.count == 0) continue;
-        for (int k = 0; k < line_size(in); k += STRIP) store(line + k, Lane{});
         int low = in.columns, high = 0;
-        with_taps(across.taps, [&](auto taps) {
-            for (int i = across.lens; i < across.lens + across.count; ++i) {
-                const float* const from = rays + ((int64_t)strip * in.lenses + i) * lens_rays;
-                gather_across<taps.value>(from, across.first_of(i), across.values_of(i, values), in.pixels, line);
-            }
-        });
         across.widen(across.lens, low, high), across.widen(across.lens + across.count - 1, low, high);
-        return_line(in, plane, ray_row, strip, ColumnBlocks(in, low, min(high, in.columns)), line, volume_out);
+        const ColumnBlocks some(in, low, min(high, in.columns));
+        for (int n = 0; n < part.rows; ++n) {
+            const float* const rays = turned + ((int64_t)n * part.strips + k) * in.lenses * lens_rays;
+            for (int at = 0; at < line_size(in); at += STRIP) store(line + at, Lane{});
+            with_taps(across.taps, [&](auto taps) {
+                for (int i = across.lens; i < across.lens + across.count; ++i)
+                    gather_across<taps.value>(rays + i * lens_rays, across.first_of(i), across.values_of(i, values),
+                                              in.pixels, line);
+            });
+            return_line(in, plane, part.first_row + n * part.step, strip, some, line, volume_out);
+        }
     }
 }
 

@@ -6,6 +6,7 @@ on the number of threads. The loops are C++, see ``separable.h``; a GPU has thos
 ``reference.separable``.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -27,14 +28,29 @@ LENS_BLOCK: int = native.constant("separable.h", "LENS_BLOCK")
 """Fewest lenses in a row whose rays a thread computes."""
 LEAST_TASKS = 4
 """Fewest tasks of a projection for each thread."""
+TURNED_RAYS = 2**20
+"""Rays that a gather takes at once: with them, the voxels that a strip sees stay in a core's caches."""
 MOST_VALUES: int = native.constant("separable.h", "MOST_VALUES")
 """Most values of the profiles across of a lens, which a thread has room for."""
+
+
+@wp.struct
+class Part:
+    """Some ray rows of some strips."""
+
+    first_row: int
+    step: int
+    """From each ray row to the next one."""
+    rows: int
+    first_strip: int
+    strips: int
 
 
 @wp.func_native("""
     const auto weights = lfpiv::separable_arrays(separable);
     const int segments = (weights.lenses + segment - 1) / segment, number = task % segments;
-    const int strip = task / segments % weights.strips, row = first_row + step * (task / segments / weights.strips);
+    const int strip = part.first_strip + task / segments / part.rows;
+    const int row = part.first_row + part.step * (task / segments % part.rows);
     const int end = lfpiv::min((number + 1) * segment, weights.lenses);
     const int64_t lines = (int64_t)weights.planes * lfpiv::line_size(weights);
     lfpiv::project_segment(weights, volume.data, row, strip, number * segment, end,
@@ -43,8 +59,7 @@ MOST_VALUES: int = native.constant("separable.h", "MOST_VALUES")
 def _project_segment(
     separable: Separable,
     volume: wp.array(dtype=float),
-    first_row: int,
-    step: int,
+    part: Part,
     segment: int,
     task: int,
     slot: int,
@@ -55,28 +70,28 @@ def _project_segment(
 
 @wp.func_native("""
     const auto weights = lfpiv::separable_arrays(separable);
-    const int64_t lens_rays = (int64_t)weights.pixels * lfpiv::STRIP;
-    const int64_t row = (int64_t)ray_row * weights.strips * weights.lenses;
-    lfpiv::turn_back_rim(weights, row + lens, rays.data, turned_out.data + lens * lens_rays);
+    const int lenses = part.strips * weights.lenses, row = part.first_row + part.step * (task / lenses);
+    const int64_t lens = ((int64_t)row * weights.strips + part.first_strip) * weights.lenses + task % lenses;
+    lfpiv::turn_back_rim(weights, lens, rays.data, turned_out.data + (int64_t)task * weights.pixels * lfpiv::STRIP);
 """)
 def _turn_back(
     separable: Separable,
     rays: wp.array(dtype=float),
-    ray_row: int,
-    lens: int,
+    part: Part,
+    task: int,
     turned_out: wp.array(dtype=float),
 ): ...
 
 
 @wp.func_native("""
     const auto weights = lfpiv::separable_arrays(separable);
-    lfpiv::gather_plane(weights, turned.data, ray_row, plane,
-                        line_out.data + (int64_t)(slot < 0 ? 0 : slot) * lfpiv::line_size(weights), volume_out.data);
+    float* const line = line_out.data + (int64_t)(slot < 0 ? 0 : slot) * lfpiv::line_size(weights);
+    lfpiv::gather_plane(weights, turned.data, part, plane, line, volume_out.data);
 """)
 def _gather_plane(
     separable: Separable,
     turned: wp.array(dtype=float),
-    ray_row: int,
+    part: Part,
     plane: int,
     slot: int,
     line_out: wp.array(dtype=float),
@@ -89,8 +104,7 @@ def _project(
     # in
     separable: Separable,
     volume: wp.array(dtype=float),
-    first_row: int,
-    step: int,
+    part: Part,
     segment: int,
     slot: int,
     first_task: int,
@@ -98,8 +112,7 @@ def _project(
     lines_out: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
 ):
-    task = first_task + wp.tid()
-    _project_segment(separable, volume, first_row, step, segment, task, slot, lines_out, rays_out)
+    _project_segment(separable, volume, part, segment, first_task + wp.tid(), slot, lines_out, rays_out)
 
 
 @wp.kernel
@@ -107,12 +120,12 @@ def _turn(
     # in
     separable: Separable,
     rays: wp.array(dtype=float),
-    ray_row: int,
-    first_lens: int,
+    part: Part,
+    first_task: int,
     # out
     turned_out: wp.array(dtype=float),
 ):
-    _turn_back(separable, rays, ray_row, first_lens + wp.tid(), turned_out)
+    _turn_back(separable, rays, part, first_task + wp.tid(), turned_out)
 
 
 @wp.kernel
@@ -120,14 +133,14 @@ def _gather(
     # in
     separable: Separable,
     turned: wp.array(dtype=float),
-    ray_row: int,
+    part: Part,
     slot: int,
     first_plane: int,
     # out
     line_out: wp.array(dtype=float),
     volume_out: wp.array(dtype=float),
 ):
-    _gather_plane(separable, turned, ray_row, first_plane + wp.tid(), slot, line_out, volume_out)
+    _gather_plane(separable, turned, part, first_plane + wp.tid(), slot, line_out, volume_out)
 
 
 class SeparableProjector(RayProjector):
@@ -156,7 +169,7 @@ class SeparableProjector(RayProjector):
             self._moved = weights.axes[2] != 2
             """Whether columns must be brought together in memory first."""
             self._arrays = self._arrays_of(weights)
-            self._turned = empty(weights.rays_of_row)
+            self._turned = empty(max(min(TURNED_RAYS, self.rays.size), weights.rays_of_row // weights.strips))
             self._lines = zeros(lines_bytes(planes, columns) // 4)
         self.map = self._map_rays()
 
@@ -198,7 +211,7 @@ class SeparableProjector(RayProjector):
         parts = runtime.CHUNKS
         segment = self._segment(len(rows) * self.weights.strips)
         tasks = len(rows) * self.weights.strips * -(-self.weights.lenses // segment)
-        inputs = [self._arrays, light, rows.start, rows.step, segment]
+        inputs = [self._arrays, light, _part(rows, 0, self.weights.strips), segment]
         launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=parts)
 
     def _segment(self, rows: int) -> int:
@@ -225,15 +238,24 @@ class SeparableProjector(RayProjector):
 
     def _gather(self, arrays: Separable, rays: wp.array, ray_set: int, out: wp.array) -> wp.array:
         """Add to `out`, shape (voxel,). Return it in the order of voxels in memory."""
-        lenses, planes = self.weights.strips * self.weights.lenses, self.weights.shape[1]
-        for row in self._ray_rows(ray_set):
-            launch(Call(_turn, lenses, [arrays, rays, row], [self._turned]))
-            outputs = [self._lines, out]
-            launch(Call(_gather, planes, [arrays, self._turned, row], outputs, scratch=True), parts=runtime.CHUNKS)
+        weights = self.weights
+        for part in self._parts(self._ray_rows(ray_set)):
+            launch(Call(_turn, part.rows * part.strips * weights.lenses, [arrays, rays, part], [self._turned]))
+            inputs, outputs = [arrays, self._turned, part], [self._lines, out]
+            launch(Call(_gather, weights.shape[1], inputs, outputs, scratch=True), parts=runtime.CHUNKS)
         if not self._moved:
             return out
         first, second, third = (self.weights.axes.index(axis) for axis in range(3))
         return _transposed(out, self.weights.shape, (first, second, third))
+
+    def _parts(self, rows: range) -> Iterator[Part]:
+        """Yield the parts that a gather takes, one after the other: all rows of some strips, or some rows of one."""
+        strips, of_strip = self.weights.strips, self.weights.rays_of_row // self.weights.strips
+        most_rows = min(self._turned.size // of_strip, len(rows))
+        most_strips = self._turned.size // (of_strip * most_rows)
+        for strip in range(0, strips, most_strips):
+            for row in range(0, len(rows), most_rows):
+                yield _part(rows[row : row + most_rows], strip, min(most_strips, strips - strip))
 
     def darken(self, ray_set: int = ALL) -> None:
         """Make the rays of a set dark that `gather` reads."""
@@ -273,6 +295,13 @@ class SeparableProjector(RayProjector):
     def largest_weight(self) -> float:
         """Return the largest weight of a ray: the largest product of two profiles of a plane."""
         return self.weights.largest
+
+
+def _part(rows: range, first_strip: int, strips: int) -> Part:
+    part = Part()
+    part.first_row, part.step, part.rows = rows.start, rows.step, len(rows)
+    part.first_strip, part.strips = first_strip, strips
+    return part
 
 
 def lines_bytes(planes: int, columns: int) -> int:

@@ -13,7 +13,7 @@ wp.set_module_options(native.options("voxels.h"))
 
 VOXELS_OF_RUN: int = native.constant("voxels.h", "VOXELS_OF_RUN")
 """Voxels that a thread of the CPU goes through."""
-FEWEST_VOXELS = 16384
+FEWEST_VOXELS = 262144
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 
 
