@@ -26,6 +26,10 @@ wp.set_module_options(native.options("separable.h", contract="fast"))
 
 LENS_BLOCK: int = native.constant("separable.h", "LENS_BLOCK")
 """Fewest lenses in a row whose rays a thread computes."""
+FEWEST_RAYS = 2**20
+"""Fewest rays times planes of voxels of a launch's part. A smaller part takes less time than to wake a thread."""
+FEWEST_LENSES = 4096
+"""Fewest lenses of a part, each in one ray row, where rims are turned back."""
 LEAST_TASKS = 4
 """Fewest tasks of a projection for each thread."""
 TURNED_RAYS = 2**20
@@ -208,11 +212,14 @@ class SeparableProjector(RayProjector):
             return
         if self._moved:
             light = _transposed(light, self.weights.voxels, self.weights.axes)
-        parts = runtime.CHUNKS
         segment = self._segment(len(rows) * self.weights.strips)
         tasks = len(rows) * self.weights.strips * -(-self.weights.lenses // segment)
         inputs = [self._arrays, light, _part(rows, 0, self.weights.strips), segment]
-        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=parts)
+        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=self._launch_parts(len(rows)))
+
+    def _launch_parts(self, rows: int) -> int:
+        """Return the parts of a launch on the CPU over some ray rows."""
+        return min(runtime.CHUNKS, 1 + rows * self.weights.rays_of_row * self.weights.shape[1] // FEWEST_RAYS)
 
     def _segment(self, rows: int) -> int:
         """Return the lenses in a row whose rays a thread computes: a whole row where there are rows enough."""
@@ -240,9 +247,10 @@ class SeparableProjector(RayProjector):
         """Add to `out`, shape (voxel,). Return it in the order of voxels in memory."""
         weights = self.weights
         for part in self._parts(self._ray_rows(ray_set)):
-            launch(Call(_turn, part.rows * part.strips * weights.lenses, [arrays, rays, part], [self._turned]))
+            lenses, parts = part.rows * part.strips * weights.lenses, self._launch_parts(part.rows)
+            launch(Call(_turn, lenses, [arrays, rays, part], [self._turned]), parts=voxels.parts_of(lenses, FEWEST_LENSES))
             inputs, outputs = [arrays, self._turned, part], [self._lines, out]
-            launch(Call(_gather, weights.shape[1], inputs, outputs, scratch=True), parts=runtime.CHUNKS)
+            launch(Call(_gather, weights.shape[1], inputs, outputs, scratch=True), parts=parts)
         if not self._moved:
             return out
         first, second, third = (self.weights.axes.index(axis) for axis in range(3))

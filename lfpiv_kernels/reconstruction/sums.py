@@ -11,7 +11,7 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.voxels import parts_of
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of
 from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
 
 wp.set_module_options(native.options("voxels.h"))
@@ -217,7 +217,7 @@ class Totals:
         threads = LANES if runtime.device().form == "gpu" else -(-values.size // PIECE)
         sums = empty(threads, wp.float64)
         call = Call(_sum_squares, threads, [weight, values, _piece(values.size, threads)], [added, sums])
-        launch(call, parts=parts_of(threads, 2))
+        launch(call, parts=parts_of(values.size, FEWEST_VOXELS))
         self.add(place, sums)
 
     def read(self) -> list[float]:

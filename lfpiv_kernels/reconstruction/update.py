@@ -16,7 +16,7 @@ from lfpiv_kernels.transfer import Values, empty, to_device, zeros
 
 wp.set_module_options(native.options("update.h"))
 
-FEWEST_RUNS = 256
+FEWEST_RUNS = 2048
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 LARGEST_MOMENTUM: float = native.constant("steps.h", "LARGEST_MOMENTUM")
 """Largest absolute exponent of momentum; beyond it the exponent counts as this one."""
