@@ -9,7 +9,7 @@ The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E
 it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
 places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
 which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark ones stay
-dark. Few iterations follow.
+dark. One iteration over all rays follows.
 
 .. [1] K. P. Lynch, F. Scarano, "An efficient and accurate approach to MTE-MART for time-resolved tomographic PIV", Exp.
    Fluids 56 (2015) 66, doi:10.1007/s00348-015-1934-6.
@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.resting_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, MotionField
@@ -37,8 +38,8 @@ ROUGHEST = 0.18
 """Largest roughness of a displacement by which particles are moved [voxel]."""
 FAINT = 0.01
 """Share of the light in the voxels that are left out of the guess before instants are compared, without a sieve."""
-ITERATIONS = 2
-"""Iterations that follow. The last one is over all rays."""
+ITERATIONS = 1
+"""Iterations that follow, over all rays."""
 
 
 def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow: xr.Dataset) -> np.ndarray:
@@ -95,8 +96,8 @@ def mean_flow(flows: Sequence[xr.Dataset]) -> xr.Dataset:
     mean = {}
     for name in (f"displacement_{axis}" for axis in "zyx"):
         values = np.array([flow[name].values for flow in flows])
-        mean[name] = flows[0][name].copy(data=np.where(weights, values, 0).sum(0) / weights.sum(0))
-    return flows[0].assign(mean | {"valid": flows[0]["valid"].copy(data=valid.any(0))})
+        mean[name] = (AXES, np.where(weights, values, 0).sum(0) / weights.sum(0), flows[0][name].attrs)
+    return flows[0].assign(mean | {"valid": (AXES, valid.any(0), flows[0]["valid"].attrs)})
 
 
 def roughness(flow: xr.Dataset) -> float:

@@ -27,8 +27,8 @@ from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
-COMPARED = 4
-"""By a fourth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
+COMPARED = 8
+"""By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.fixed_lag import ITERATIONS as CORRECTIONS
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.flow import measure_flow
@@ -237,8 +238,10 @@ class SequenceSolver:
             return before.flow, None
         if before.flow is None:
             return found, found
-        names = [f"displacement_{axis}" for axis in "zyx"]
-        mean = {name: FLOW_MEMORY * before.flow[name] + (1 - FLOW_MEMORY) * found[name] for name in names}
+        mean = {}
+        for name in (f"displacement_{axis}" for axis in "zyx"):
+            values = FLOW_MEMORY * before.flow[name].values + (1 - FLOW_MEMORY) * found[name].values
+            mean[name] = (AXES, values, found[name].attrs)
         return found.assign(mean), found
 
 
