@@ -215,7 +215,8 @@ class SeparableProjector(RayProjector):
         segment = self._segment(len(rows) * self.weights.strips)
         tasks = len(rows) * self.weights.strips * -(-self.weights.lenses // segment)
         inputs = [self._arrays, light, _part(rows, 0, self.weights.strips), segment]
-        launch(Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True), parts=self._launch_parts(len(rows)))
+        call = Call(_project, tasks, inputs, [self._lines, self.rays], scratch=True)
+        launch(call, parts=self._launch_parts(len(rows)))
 
     def _launch_parts(self, rows: int) -> int:
         """Return the parts of a launch on the CPU over some ray rows."""
@@ -247,10 +248,12 @@ class SeparableProjector(RayProjector):
         """Add to `out`, shape (voxel,). Return it in the order of voxels in memory."""
         weights = self.weights
         for part in self._parts(self._ray_rows(ray_set)):
-            lenses, parts = part.rows * part.strips * weights.lenses, self._launch_parts(part.rows)
-            launch(Call(_turn, lenses, [arrays, rays, part], [self._turned]), parts=voxels.parts_of(lenses, FEWEST_LENSES))
+            lenses = part.rows * part.strips * weights.lenses
+            turn = Call(_turn, lenses, [arrays, rays, part], [self._turned])
+            launch(turn, parts=voxels.parts_of(lenses, FEWEST_LENSES))
             inputs, outputs = [arrays, self._turned, part], [self._lines, out]
-            launch(Call(_gather, weights.shape[1], inputs, outputs, scratch=True), parts=parts)
+            gather = Call(_gather, weights.shape[1], inputs, outputs, scratch=True)
+            launch(gather, parts=self._launch_parts(part.rows))
         if not self._moved:
             return out
         first, second, third = (self.weights.axes.index(axis) for axis in range(3))

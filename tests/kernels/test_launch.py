@@ -1,5 +1,7 @@
 """Launches of Warp kernels in parts."""
 
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +11,8 @@ import warp as wp
 from lfpiv_kernels import runtime
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.transfer import to_device
+
+TIMEOUT_S = 60.0
 
 
 @wp.kernel
@@ -68,3 +72,34 @@ def test_arrays_on_the_cpu_are_views():
     array = to_device(values, device="cpu")
     values[2] = 7.0
     assert array.numpy()[2] == 7.0
+
+
+def test_an_error_of_a_part_reaches_the_caller_after_all_parts_have_ended(device, monkeypatch):
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=2))
+    both, ended = threading.Barrier(2), []
+
+    def job(part, first, last):
+        if part < 2:
+            both.wait(TIMEOUT_S)  # one on the calling thread, one on another
+        if threading.current_thread() is not threading.main_thread():
+            time.sleep(0.05)
+            ended.append(part)
+            return
+        raise ValueError(f"part {part}")
+
+    with pytest.raises(ValueError, match="part"):
+        runtime.run_chunks(4, job, chunks=4, warp_device="cpu")
+    assert len(ended) == 3
+
+
+def test_an_error_on_another_thread_reaches_the_caller(device, monkeypatch):
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=2))
+    both = threading.Barrier(2)
+
+    def job(part, first, last):
+        both.wait(TIMEOUT_S)
+        if threading.current_thread() is not threading.main_thread():
+            raise ValueError(f"part {part}")
+
+    with pytest.raises(ValueError, match="part"):
+        runtime.run_chunks(2, job, chunks=2, warp_device="cpu")

@@ -8,7 +8,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.weights.separable_planes import Planes
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference
-from lfpiv_kernels.reconstruction import separable_gpu
+from lfpiv_kernels.reconstruction import projector_separable, separable_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
 from lfpiv_kernels.reconstruction.separable_gpu import LinesProjector
@@ -102,13 +102,25 @@ def test_projection_and_back_projection_are_adjoint(case):
     np.testing.assert_allclose(found, expected, atol=2 * ROUNDING * expected.max())
 
 
-def test_images_do_not_depend_on_threads(case, monkeypatch):
+@pytest.mark.parametrize("rays_at_once", [1, 5000, 30_000])
+def test_light_does_not_depend_on_how_the_work_is_cut(case, rays_at_once, monkeypatch):
     _, weights, projector, matrix = case
-    volume = np.random.default_rng(6).random(matrix.shape[1]).astype(np.float32)
-    pixels = int(np.prod(weights.sensor_shape))
-    found = projector.project(volume, np.zeros(pixels, np.float32))
-    monkeypatch.setattr("lfpiv_kernels.reconstruction.projector_separable.LEAST_TASKS", 100)  # short segments
-    np.testing.assert_array_equal(projector.project(volume, np.zeros(pixels, np.float32)), found)
+    rng = np.random.default_rng(6)
+    sizes = matrix.shape[1], int(np.prod(weights.sensor_shape))
+    volume, image = (rng.random(size).astype(np.float32) for size in sizes)
+
+    def light(of, ray_set):
+        projected = of.project(volume, np.zeros_like(image), ray_set)
+        return projected, of.back_project(image, np.zeros_like(volume), ray_set)
+
+    whole = [light(projector, ray_set) for ray_set in (ALL, 1)]
+    small = {"LEAST_TASKS": 100, "FEWEST_RAYS": 1, "FEWEST_LENSES": 1, "TURNED_RAYS": rays_at_once}
+    for constant, value in small.items():
+        monkeypatch.setattr(projector_separable, constant, value)  # short segments, many launches of many parts
+    cut = SeparableProjector(weights, SETS)
+    for ray_set, expected in zip((ALL, 1), whole, strict=True):
+        for found, one in zip(light(cut, ray_set), expected, strict=True):
+            np.testing.assert_array_equal(found, one)
 
 
 @pytest.mark.parametrize("at_once", ["all ray rows", "one ray row"])

@@ -18,8 +18,9 @@ SIZES = [1, 7, 1025, 20_011]
 
 
 @pytest.fixture(params=SIZES)
-def volumes(request):
-    """Four volumes: positive, with zeros, of 0 and 1, and of any sign."""
+def volumes(request, monkeypatch):
+    """Four volumes: positive, with zeros, of 0 and 1, and of any sign. Sweeps of the largest are cut."""
+    monkeypatch.setattr(voxels, "FEWEST_VOXELS", 8192)
     rng = np.random.default_rng(request.param)
     lit = (rng.random(request.param) > 0.3).astype(np.float32)
     positive, signed = rng.lognormal(0, 2, request.param).astype(np.float32), rng.normal(size=request.param)
@@ -92,7 +93,7 @@ def test_the_faintest_kept_voxel_is_that_of_the_sorted_light(volumes, share):
 
 def test_sums_do_not_depend_on_the_threads(monkeypatch):
     rng = np.random.default_rng(1)
-    weight, values = (to_device(rng.normal(size=100_003).astype(np.float32)) for _ in range(2))
+    weight, values = (to_device(rng.normal(size=2 * voxels.FEWEST_VOXELS + 3).astype(np.float32)) for _ in range(2))
     device, found = runtime.device(), []
     for threads in (1, 2, 5):
         used = min(threads, device.threads)
