@@ -54,8 +54,8 @@ class PreparedInstant:
     ) -> Reconstruction:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
-        `whole_passes` is the number of passes over all rays after those over subsets, at most half of all passes;
-        default: `WHOLE_PASSES`, or `POINT_PASSES` after subsets of all cameras without a sieve. A
+        `whole_passes` is the number of passes over all rays after those over subsets; default: `WHOLE_PASSES`, or
+        `POINT_PASSES` after subsets of all cameras without a sieve, at most half of all passes. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
         misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
         where the first guess is that of the images. Another one shows where particles are: without a sieve, voxels that
@@ -72,8 +72,8 @@ class PreparedInstant:
         history = History(settings, count)
         if whole_passes is None:
             points = normalisation.is_joint and normalisation.sieve.sigma_voxel == 0
-            whole_passes = POINT_PASSES if points else WHOLE_PASSES
-        possible = count - min(whole_passes, -(-count // 2)) if normalisation.has_subsets else 0
+            whole_passes = min(POINT_PASSES if points else WHOLE_PASSES, -(-count // 2))
+        possible = max(count - whole_passes, 0) if normalisation.has_subsets else 0
         partitions = normalisation.partitions if possible else ()
         epochs = min(possible, partitions[0].most_epochs) if possible and normalisation.is_joint else possible
         rose = False

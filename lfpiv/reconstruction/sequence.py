@@ -226,7 +226,7 @@ class SequenceSolver:
         if flow is None or not others:
             return alone or own.prepared.solve(progress=progress)
         guess = _concentrated(agreed_guess(own.found, others, flow), own.found)
-        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=1, first=guess, brief=True, progress=progress)
+        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=CORRECTIONS, first=guess, progress=progress)
         return own.found.continued_by(after)
 
     def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
