@@ -28,6 +28,7 @@ from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Scene, light_scatter
 from lfpiv.tracking.size_fit import LARGEST_RATIO, USUAL_SIGMA_VOXEL, fit_size
+from lfpiv.tracking.splitting import split
 from lfpiv.tracking.surroundings import whole_pixels
 from lfpiv.weights.operator import Weights
 
@@ -281,7 +282,7 @@ class ParticleSearch:
             return False
         fit.surround()
         fit.refine(STEPS - 1)
-        fit.cloud = self._kept(fit)
+        fit.cloud = self._kept(fit, splits=True)
         if not len(fit.cloud):
             return False
         fit.refine(1)
@@ -317,12 +318,12 @@ class ParticleSearch:
         least = max(CANDIDATE * faint, self.weakest * candidates.typical(fit.cloud.light.mean(1)))
         return candidates.volume_peaks(self.weights, volume, least)
 
-    def _kept(self, fit: Fit, part: float = 1.0, *, fits: bool = True) -> Cloud:
+    def _kept(self, fit: Fit, part: float = 1.0, *, fits: bool = True, splits: bool = False) -> Cloud:
         """Return the particles that a camera shows, those closer than one particle's size merged.
 
         One that only some of the cameras show explains light there, and keeps others from moving to it. `part` is the
         part of the limits of light that applies. With `fits`, particles whose images the model does not fit are
-        removed, so that their light may give others.
+        removed, so that their light may give others. With `splits`, two take the place of one where that explains more.
         """
         cloud, normal = fit.cloud, fit.normal
         assert normal is not None
@@ -331,9 +332,11 @@ class ParticleSearch:
         fit.error = confirmation.model_error(misfit, found)
         good = lies_in(cloud.positions_mm, self.weights.grid, MARGIN_VOXEL)
         good &= (confirmation.shown(normal, found, fit.error, self._least(cloud), part) & found.seen).any(1)
-        if fits:
-            good &= confirmation.fitting(lacking, fit.error, found)
-        return confirmation.merged(normal, cloud, good, found.position_error, fit.model.voxel_mm)
+        fitting = confirmation.fitting(lacking, fit.error, found) if fits else np.ones(len(cloud), bool)
+        kept = confirmation.merged(normal, cloud, good & fitting, found.position_error, fit.model.voxel_mm)
+        if splits and (good & ~fitting).any():
+            kept = kept.joined(split(fit.model, fit.scene, cloud, normal, good & ~fitting))
+        return kept
 
     def _confirmed(self, fit: Fit) -> np.ndarray:
         """Return the particles that all cameras which see them show, shape (particle,), bool."""

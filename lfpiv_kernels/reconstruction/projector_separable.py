@@ -220,6 +220,8 @@ class SeparableProjector(RayProjector):
 
     def _launch_parts(self, rows: int) -> int:
         """Return the parts of a launch on the CPU over some ray rows."""
+        if runtime.device().threads == 1:
+            return 1
         return min(runtime.CHUNKS, 1 + rows * self.weights.rays_of_row * self.weights.shape[1] // FEWEST_RAYS)
 
     def _segment(self, rows: int) -> int:
