@@ -71,7 +71,7 @@ def split(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal, ch
             left = weight[span][there] * np.square(target[there])
             excess += float((left - 1).sum())
             target[there] += cloud.light[number, camera] * one.data
-            of_pair, explained = _pairs(values, weight[span], target)
+            of_pair, explained = fit_pairs(values, weight[span], target)
             gain += explained
             light.append(of_pair)
         best = int(np.argmax(gain))
@@ -83,7 +83,7 @@ def split(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal, ch
     return Cloud(positions_mm=np.array(positions), light=np.array(lights))
 
 
-def _pairs(values: sparse.csr_array, weight: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_pairs(values: sparse.csr_array, weight: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit the light of pairs to an image of one camera.
 
     `values` are the images of one particle, of the first and of the second ones of all pairs. Return the light, shape
@@ -100,6 +100,7 @@ def _pairs(values: sparse.csr_array, weight: np.ndarray, target: np.ndarray) -> 
     light = np.stack([(bb * a - both * b) / determinant, (aa * b - both * a) / determinant], axis=1)
     better = alone[1 : 1 + pairs] >= alone[1 + pairs :]
     single = np.stack([np.where(better, a / aa, 0), np.where(better, 0, b / bb)], axis=1)
-    light = np.where((light > 0).all(1)[:, None], light, np.maximum(single, 0))
+    both_lit = np.minimum(light[:, 0], light[:, 1]) > 0
+    light = np.where(both_lit[:, None], light, np.maximum(single, 0))
     explained = (light * np.stack([a, b], axis=1)).sum(1)
     return light, explained - alone[0]

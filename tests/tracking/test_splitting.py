@@ -7,7 +7,7 @@ from support.tracking_rig import READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
 
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Scene, refine, rendered
-from lfpiv.tracking.splitting import DIRECTIONS, HALF_DISTANCES, _pairs, split
+from lfpiv.tracking.splitting import DIRECTIONS, HALF_DISTANCES, fit_pairs, split
 
 SCATTER = 0.3
 LIGHT = 2e4
@@ -71,7 +71,7 @@ def test_light_of_pairs_is_that_of_least_squares_without_negative_light():
     pairs, pixels = 40, 30
     values = rng.random((1 + 2 * pairs, pixels)) * (rng.random((1 + 2 * pairs, pixels)) > 0.4)
     weight, target = 0.1 + rng.random(pixels), rng.standard_normal(pixels) + 0.3
-    light, explained = _pairs(sparse.csr_array(values), weight, target)
+    light, explained = fit_pairs(sparse.csr_array(values), weight, target)
     root = np.sqrt(weight)
     alone = optimize.nnls((root * values[0])[:, None], root * target)[1]
     for number in range(pairs):
