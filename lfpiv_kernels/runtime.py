@@ -270,5 +270,6 @@ def run_chunks(
     finally:
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
+        del job  # a thread that is late still holds `work`, which must not keep the job's arrays
     for helper in begun:
         helper.result()

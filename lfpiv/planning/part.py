@@ -291,8 +291,9 @@ def measure(part: Volume, forms: Mapping[str, Form], per_voxel: float, *, check_
         return volume_on(found.to_dataarray(), part.experiment.grid)
 
     def look(number: int) -> None:
-        sizer.matching_sieve(frames[number][0])
-        sizer.brightness_scatter(frames[number][0], part.particle_voxel)
+        seen = sizer.fluctuations(frames[number][0])
+        sizer.matching_sieve(seen)
+        sizer.brightness_scatter(seen, part.particle_voxel)
 
     _, first = timed(lambda: solve(0))
     runs = [timed(lambda: solve(1)) for _ in range(2)]  # the faster one: other programs disturb

@@ -38,7 +38,7 @@ ROUGHEST = 0.18
 """Largest roughness of a displacement by which particles are moved [voxel]."""
 FAINT = 0.01
 """Share of the light in the voxels that are left out of the guess before instants are compared, without a sieve."""
-ITERATIONS = 2
+ITERATIONS = 1
 """Iterations that follow, over all rays."""
 
 

@@ -221,7 +221,7 @@ def iterate_epochs(
             over = steps[0].over(active)
         length = 1 / (1 + SHORTENING * epoch)
         start = duplicate(coefficients)
-        agreement = Agreement(start) if partition.conflict > 0 else None
+        agreement = Agreement(start) if partition.conflict > 0 and epoch + 1 < epochs else None
         equations.begin()
         lengths = partition.lengths or (1.0,) * len(steps)
         for subset, step, of_subset in zip(partition.subsets, steps, lengths, strict=True):

@@ -23,6 +23,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -64,6 +66,51 @@ SIEVE_STEP_VOXEL = 0.05
 """Sieves are rounded to multiples of this [voxel], so that the frames of a run have the same sieve."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fluctuations:
+    """Fluctuations of one camera's sub-aperture images and of their neighbours in the pupil: independent noise."""
+
+    light: np.ndarray
+    """Light of each sub-aperture image, shape (sub-aperture,) [counts]."""
+    here: np.ndarray
+    """Light less its mean, shape (sub-aperture, j, i) [counts]."""
+    right: np.ndarray
+    """The same of the neighbours to the right."""
+    below: np.ndarray
+    """The same of the neighbours below."""
+
+    @cached_property
+    def covariances(self) -> np.ndarray:
+        """Sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away.
+
+        The mean product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
+        """
+        far = np.mean([self._apart(lenses) for lenses in FAR_LENSES], axis=0)
+        return np.stack([2 * self._products - far, self._apart(1) - far])
+
+    @cached_property
+    def cumulants(self) -> np.ndarray:
+        """Sums over the lenses, shape (3, sub-aperture): the light, products of two and of three fluctuations.
+
+        The fluctuations are those of neighbours in the pupil at the same lens.
+        """
+        return np.stack([self.light, self._products, (self.here * self.right * self.below).sum((1, 2))])
+
+    @cached_property
+    def _products(self) -> np.ndarray:
+        """Sums of products at the same lens, mean of both neighbours, shape (sub-aperture,)."""
+        products: np.ndarray = (self.here * (self.right + self.below)).sum((1, 2)) / 2
+        return products
+
+    def _apart(self, lenses: int) -> np.ndarray:
+        """Return the sums of products some lenses apart, mean of both directions, shape (sub-aperture,)."""
+        here, right, below = self.here, self.right, self.below
+        along_i = here[..., :-lenses] * below[..., lenses:] + here[..., lenses:] * below[..., :-lenses]
+        along_j = here[:, :-lenses] * right[:, lenses:] + here[:, lenses:] * right[:, :-lenses]
+        apart: np.ndarray = (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
+        return apart
+
+
 class SubApertures:
     """Sub-aperture images of one camera, and the neighbours of their pixels in the pupil.
 
@@ -91,42 +138,14 @@ class SubApertures:
         self._lit = steady[0] > LIT_SHARE * steady[0].max()
         self._even = [(light * self._lit, _local_mean(light * self._lit)) for light in steady]
 
-    def covariances(self, image: np.ndarray) -> np.ndarray:
-        """Return sums of products of neighbours in the pupil, shape (2, sub-aperture): at the same lens, one away.
-
-        The mean product `FAR_LENSES` away is subtracted: light that varies slowly and was not removed with the mean.
-        """
-        here, right, below = self._fluctuations(np.asarray(image, np.float32).reshape(-1))
-        same = (here * (right + below)).sum((1, 2))
-        near = self._apart(here, right, below, 1)
-        far = np.mean([self._apart(here, right, below, lenses) for lenses in FAR_LENSES], axis=0)
-        return np.stack([same - far, near - far])
-
-    def cumulants(self, image: np.ndarray) -> np.ndarray:
-        """Return sums over the lenses, shape (3, sub-aperture): the light, products of two and of three fluctuations.
-
-        The fluctuations are those of neighbours in the pupil at the same lens, whose noise is independent.
-        """
+    def fluctuations(self, image: np.ndarray) -> Fluctuations:
+        """Measure the fluctuations of an image, shape (rows, columns)."""
         pixels = np.asarray(image, np.float32).reshape(-1)
-        here, right, below = self._fluctuations(pixels)
-        light = (pixels[self._first] * self._lit).sum((1, 2))
-        return np.stack([light, (here * (right + below)).sum((1, 2)) / 2, (here * right * below).sum((1, 2))])
-
-    def _fluctuations(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the fluctuations of the sub-apertures and of their neighbours to the right and below."""
+        neighbours = [pixels[self._first + step] * self._lit for step in self._steps]
         here, right, below = (
-            self._fluctuation(pixels[self._first + step] * self._lit, even, unit)
-            for step, (even, unit) in zip(self._steps, self._even, strict=True)
+            self._fluctuation(light, even, unit) for light, (even, unit) in zip(neighbours, self._even, strict=True)
         )
-        return here, right, below
-
-    @staticmethod
-    def _apart(here: np.ndarray, right: np.ndarray, below: np.ndarray, lenses: int) -> np.ndarray:
-        """Return the sums of products some lenses apart, mean of both directions, shape (sub-aperture,)."""
-        along_i = here[..., :-lenses] * below[..., lenses:] + here[..., lenses:] * below[..., :-lenses]
-        along_j = here[:, :-lenses] * right[:, lenses:] + here[:, lenses:] * right[:, :-lenses]
-        apart: np.ndarray = (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
-        return apart
+        return Fluctuations(light=neighbours[0].sum((1, 2)), here=here, right=right, below=below)
 
     def _fluctuation(self, light: np.ndarray, even: np.ndarray, unit: np.ndarray) -> np.ndarray:
         """Subtract the mean light: that of an evenly lit volume times a slowly varying factor. 0 where it is dark.
@@ -187,15 +206,26 @@ class ParticleSizer:
         for width in WIDTHS_VOXEL:
             images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=own)
             for name, sub_apertures in known.items():
-                same, next_lens = sub_apertures.covariances(images[name]).sum(1)
+                found = sub_apertures.fluctuations(images[name])
+                same, next_lens = found.covariances.sum(1)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
-                equal[name].append(_skewness(sub_apertures.cumulants(images[name])))
+                equal[name].append(_skewness(found.cumulants))
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}
         """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising."""
         self._equal = equal
         """`_skewness` of equal particles for each of `WIDTHS_VOXEL`."""
 
-    def size(self, images: Mapping[str, np.ndarray]) -> float | None:
+    def fluctuations(self, images: Mapping[str, np.ndarray]) -> dict[str, Fluctuations]:
+        """Measure what the other methods take, by camera.
+
+        Parameters
+        ----------
+        images : mapping of str to ndarray
+            Camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
+        """
+        return {name: one.fluctuations(images[name]) for name, one in self._sub_apertures.items()}
+
+    def size(self, fluctuations: Mapping[str, Fluctuations]) -> float | None:
         """Estimate the size of the particles: the Gaussian of voxels whose images are as wide as the measured ones.
 
         Assumes that particles lie at random and are of about one size. Their number and brightness do not matter, nor
@@ -203,8 +233,8 @@ class ParticleSizer:
 
         Parameters
         ----------
-        images : mapping of str to ndarray
-            Camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
+        fluctuations : mapping of str to Fluctuations
+            From `fluctuations`.
 
         Returns
         -------
@@ -216,7 +246,7 @@ class ParticleSizer:
         """
         variances = []
         for name, known in self._ratios.items():
-            here, next_lens = self._sub_apertures[name].covariances(images[name])
+            here, next_lens = fluctuations[name].covariances
             count = len(here)
             if known[-1] - known[0] < LEAST_RANGE or not here.mean() > SIGNIFICANCE * here.std() / count**0.5:
                 continue
@@ -225,27 +255,27 @@ class ParticleSizer:
             variances.append(np.interp(ratio, known, np.square(WIDTHS_VOXEL)))
         return float(np.sqrt(np.mean(variances))) if variances else None
 
-    def matching_sieve(self, images: Mapping[str, np.ndarray]) -> float:
+    def matching_sieve(self, fluctuations: Mapping[str, Fluctuations]) -> float:
         """Return the size of the sieve that matches the particles [voxel]; 0 if they are small or of unknown size.
 
         Its variance is that of the particles less `VOXEL_VARIANCE`: a particle between voxels is a sum of Gaussians.
         """
-        size = self.size(images)
+        size = self.size(fluctuations)
         exact = np.sqrt(max((size or 0.0) ** 2 - VOXEL_VARIANCE, 0.0))
         sieve = round(SIEVE_STEP_VOXEL * round(exact / SIEVE_STEP_VOXEL), 2)
         text = "unknown size, in" if size is None else f"{size:.2f}"
         log.debug("particles of %s voxel: sieve of %.2f voxel", text, sieve)
         return sieve if sieve >= LEAST_SIEVE_VOXEL else 0.0
 
-    def brightness_scatter(self, images: Mapping[str, np.ndarray], sieve_voxel: float) -> float | None:
+    def brightness_scatter(self, fluctuations: Mapping[str, Fluctuations], sieve_voxel: float) -> float | None:
         """Estimate how unlike bright the particles are in a camera, <a><a^3> / <a^2>^2 of a particle's light a.
 
         Light that is no particle's, such as stray light, raises it.
 
         Parameters
         ----------
-        images : mapping of str to ndarray
-            As of `size`.
+        fluctuations : mapping of str to Fluctuations
+            From `fluctuations`.
         sieve_voxel : float
             The sieve that matches the particles' size [voxel], 0 for small ones.
 
@@ -256,7 +286,7 @@ class ParticleSizer:
         """
         scatters, variance = [], sieve_voxel**2 + VOXEL_VARIANCE if sieve_voxel else 0.0
         for name, known in self._equal.items():
-            cumulants = self._sub_apertures[name].cumulants(images[name])
+            cumulants = fluctuations[name].cumulants
             products = cumulants[1]
             equal = float(np.interp(variance, np.square(WIDTHS_VOXEL), known))
             if equal > 0 and products.mean() > SIGNIFICANCE * products.std() / len(products) ** 0.5:

@@ -56,7 +56,7 @@ def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[
         coarse = build_weights(calibration, _central(grid, longest_mm, longest_mm / LARGEST_PART), form="pixels")
         even = coarse(np.ones(coarse.grid.shape, np.float32))
     sizer = ParticleSizer(weights, even)
-    found = [size for image in images if (size := sizer.size(image)) is not None]
+    found = [size for image in images if (size := sizer.size(sizer.fluctuations(image))) is not None]
     return float(np.sqrt(np.mean(np.square(found)))) if found else None
 
 

@@ -75,8 +75,8 @@ class SmartSolver:
     ) -> PreparedInstant:
         """Measure what SMART needs to know of the images of one instant; arguments and exceptions as of `solve`."""
         images = checked_images(self.weights, images)
-        sieve = Sieve(self._sieve_voxel(images), self.weights.stored.shape)
-        cap, share = self._intensity_cap(images, sieve), self.settings.floor_share
+        sieve, cap = self._sieve_and_cap(images)
+        share = self.settings.floor_share
         recordings = record(self.weights, images, floor=floor, floor_share=share, intensity_cap=cap)
         normalisation = self._normalisation({name: one.camera_gain for name, one in recordings.items()}, sieve)
         equations = ImageEquations(
@@ -142,19 +142,19 @@ class SmartSolver:
         alone = [len(projector.see_only(number)) for number in range(projector.ray_sets)]
         return min(alone) > 0 and sum(alone) >= LEAST_ALONE * len(projector.see_only(ALL))
 
-    def _sieve_voxel(self, images: Mapping[str, np.ndarray]) -> float:
-        sieve = self.settings.sieve_voxel
-        return self._particle_sizer.matching_sieve(images) if isinstance(sieve, str) else sieve
-
-    def _intensity_cap(self, images: Mapping[str, np.ndarray], sieve: Sieve) -> float:
-        cap = self.settings.intensity_cap
-        if not isinstance(cap, str):
-            return cap
-        scatter = self._particle_sizer.brightness_scatter(images, sieve.sigma_voxel)
+    def _sieve_and_cap(self, images: Mapping[str, np.ndarray]) -> tuple[Sieve, float]:
+        """Return the sieve and the limit of the counts. Those that the settings leave open follow from the images."""
+        wanted, cap = self.settings.sieve_voxel, self.settings.intensity_cap
+        sizer = self._particle_sizer if isinstance(wanted, str) or isinstance(cap, str) else None
+        seen = {} if sizer is None else sizer.fluctuations(images)
+        sigma = sizer.matching_sieve(seen) if sizer is not None and isinstance(wanted, str) else float(wanted)
+        sieve = Sieve(sigma, self.weights.stored.shape)
+        if sizer is None or not isinstance(cap, str):
+            return sieve, float(cap)
+        scatter = sizer.brightness_scatter(seen, sigma)
         if scatter is not None and scatter < UNLIKE:
-            return 0.0
-        points = self.settings.sieve_voxel == AUTO and sieve.sigma_voxel == 0
-        return POINT_CAP if points else CAP
+            return sieve, 0.0
+        return sieve, POINT_CAP if wanted == AUTO and sigma == 0 else CAP
 
     @property
     def _particle_sizer(self) -> ParticleSizer:

@@ -119,7 +119,7 @@ class RecordedImages:
 
         They are not numbers where there is no light.
         """
-        covariances: np.ndarray = self._sub_apertures[name].covariances(image).sum(1)
+        covariances: np.ndarray = self._sub_apertures[name].fluctuations(image).covariances.sum(1)
         ratios: np.ndarray = covariances / (self._light(name, image) ** 2 or np.nan)
         return ratios
 

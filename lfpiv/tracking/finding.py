@@ -296,7 +296,7 @@ class ParticleSearch:
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
-        found = self._sizer.size(images)
+        found = self._sizer.size(self._sizer.fluctuations(images))
         return found * self.weights.grid.voxel_mm / self._grid.voxel_mm if found else USUAL_SIGMA_VOXEL
 
     def _by_camera(self, counts: np.ndarray) -> dict[str, np.ndarray]:

@@ -479,7 +479,8 @@ def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, cou
     rng = np.random.default_rng([round(10 * sigma_voxel), round(10 * ppm)])
     positions = rng.uniform(-0.5, 0.5, (round(400 * ppm), 3)) * (2.0, 2.0, 1.8)
     images = traced_images(rig, positions, sigma_voxel * 0.1, 1, counts=counts)
-    size = particle_size.ParticleSizer(weights).size(images)
+    sizer = particle_size.ParticleSizer(weights)
+    size = sizer.size(sizer.fluctuations(images))
     assert size == pytest.approx(np.sqrt(max(sigma_voxel**2 - 1 / 12, 0)), abs=TOLERANCE_SIZE)
     volume = plain_steps.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
     if sigma_voxel:
@@ -493,7 +494,8 @@ def test_images_of_noise_ask_for_no_sieve(small_volume):
     rig, weights = small_volume
     images = traced_images(rig, np.zeros((1, 3)), 0.1, 2, counts=0.0)
     sizer = particle_size.ParticleSizer(weights)
-    assert sizer.size(images) is None and sizer.matching_sieve(images) == 0.0
+    seen = sizer.fluctuations(images)
+    assert sizer.size(seen) is None and sizer.matching_sieve(seen) == 0.0
 
 
 def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated():
