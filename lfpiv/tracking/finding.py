@@ -25,6 +25,7 @@ from lfpiv.settings.processing import Tracking
 from lfpiv.tracking import candidates, confirmation
 from lfpiv.tracking.fit import Fit, faint_light, scene_of
 from lfpiv.tracking.found import FoundParticles
+from lfpiv.tracking.lines_of_sight import REFINED, follow_lines
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Scene, light_scatter
 from lfpiv.tracking.size_fit import LARGEST_RATIO, USUAL_SIGMA_VOXEL, fit_size
@@ -292,7 +293,16 @@ class ParticleSearch:
             fit_size(fit)
         fit.surround()
         fit.refine(1)
+        self._follow_lines(fit)
         return True
+
+    def _follow_lines(self, fit: Fit) -> None:
+        """Move particles that a camera does not confirm along the line of sight of one that shows them."""
+        assert fit.normal is not None
+        alone = ~self._confirmed(fit)
+        if alone.any():
+            fit.cloud = follow_lines(fit.model, fit.scene, fit.cloud, fit.normal, alone)
+            fit.refine(REFINED)
 
     def _first_size(self, images: Mapping[str, np.ndarray]) -> float:
         self._sizer = self._sizer or ParticleSizer(self.weights)
