@@ -27,6 +27,8 @@ STEP_VOXEL = 0.25
 """Distance of the places that are tried [voxel]."""
 LARGEST_LACK = 0.3
 """Largest light that images may lack of a particle's at a new place, relative to it."""
+AT_ONCE = 64
+"""Lines whose images are made at once."""
 REFINED = 2
 """Iterations by which moved particles are refined."""
 
@@ -56,21 +58,26 @@ class _Line:
         root = np.sqrt(self.information)
         signal = light * root
         seen = root > SEEN * root.max(1, keepdims=True)
-        lack = np.stack([self._lack(camera, light, left, weights) for camera in range(len(left))], axis=1)
-        good = ((signal > SIGNIFICANCE) & (lack < LARGEST_LACK**2)) | ~seen
-        score = np.where(good.all(1), np.square(signal).sum(1) - SIGNIFICANCE**2, 0)
-        score[0] = np.square(signal[0]).max()
+        own = float(np.square(signal[0]).max())
+        score = np.where(((signal > SIGNIFICANCE) | ~seen).all(1), np.square(signal).sum(1) - SIGNIFICANCE**2, 0)
+        better = np.flatnonzero(score > own)
+        for camera in range(len(left)):
+            lacking = self._lack(camera, better, light, left, weights) >= LARGEST_LACK**2
+            score[better[lacking & seen[better, camera]]] = 0
+        score[0] = own
         return light, score
 
-    def _lack(self, camera: int, light: np.ndarray, left: list[np.ndarray], weights: list[np.ndarray]) -> np.ndarray:
+    def _lack(
+        self, camera: int, places: np.ndarray, light: np.ndarray, left: list[np.ndarray], weights: list[np.ndarray]
+    ) -> np.ndarray:
         """Return the square of the light that an image lacks relative to the particle's, beyond noise, as `misfits`."""
-        image, weight = self.images[camera], weights[camera]
-        place = np.repeat(np.arange(len(light)), np.diff(image.indptr))
+        image, weight = self.images[camera][places], weights[camera]
+        place = np.repeat(np.arange(len(places)), np.diff(image.indptr))
         known, share = weight[image.indices], np.square(image.data)
-        own = light[place, camera] * image.data
+        own = light[places[place], camera] * image.data
         dark = np.minimum(left[camera][image.indices] / np.maximum(known, 1e-30) - own, 0)
         below, above = (
-            np.bincount(place, share * values, minlength=len(light))
+            np.bincount(place, share * values, minlength=len(places))
             for values in (known * np.square(own), known * np.square(dark) - 0.5)
         )
         lack: np.ndarray = above / np.maximum(below, 1e-30)
@@ -106,20 +113,25 @@ def follow_lines(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Nor
     residual = scene.residual(rendered(images, images.lists(others.positions_mm), others.light)).astype(float)
     weight = scene.known(normal.model) / scene.variance(normal.model).astype(float)
     weights, left = [weight[span] for span in spans], [weight[span] * residual[span] for span in spans]
-    waiting = [_line(images, weights, places) for places in _places(images, weights, cloud[chosen])]
+    lines = _lines(images, weights, _places(images, weights, cloud[chosen]))
+    crossing = [_crossing(lines, camera) for camera in range(len(weights))]
+    looked = {number: line.look(left, weights) for number, line in enumerate(lines)}
     positions, lights = [], []
-    while waiting:
-        looked = [line.look(left, weights) for line in waiting]
-        number = int(np.argmax([score.max() for _, score in looked]))
-        line, (light, score) = waiting.pop(number), looked[number]
+    while looked:
+        number = max(looked, key=lambda one: looked[one][1].max())
+        light, score = looked.pop(number)
         place = int(score.argmax())
         if not score[place] > SIGNIFICANCE**2:
             break
-        positions.append(line.positions_mm[place])
+        positions.append(lines[number].positions_mm[place])
         lights.append(light[place])
-        for camera, image in enumerate(line.images):
+        changed = set[int]()
+        for camera, image in enumerate(lines[number].images):
             one = image[[place]]
             left[camera][one.indices] -= weights[camera][one.indices] * light[place, camera] * one.data
+            changed.update(crossing[camera][:, one.indices].indices.tolist())
+        for other in sorted(changed & looked.keys()):
+            looked[other] = lines[other].look(left, weights)
     if not positions:
         return others
     return others.joined(Cloud(positions_mm=np.array(positions), light=np.array(lights)))
@@ -147,11 +159,28 @@ def _places(images: ParticleImages, weights: list[np.ndarray], cloud: Cloud) -> 
     return found
 
 
-def _line(images: ParticleImages, weights: list[np.ndarray], positions_mm: np.ndarray) -> _Line:
-    found, information = [], []
-    for weight, own in zip(weights, images.lists(positions_mm), strict=True):
-        shape = (len(positions_mm), len(weight))
-        image = sparse.csr_array((own.values[:, 3].astype(float), own.pixel, own.first), shape=shape)
-        found.append(image)
-        information.append(image.power(2) @ weight)
-    return _Line(positions_mm=positions_mm, images=found, information=np.maximum(np.stack(information, axis=1), 1e-30))
+def _crossing(lines: list[_Line], camera: int) -> sparse.csc_array:
+    """Return which lines light which pixels of a camera, shape (line, pixel)."""
+    pixels = [np.unique(line.images[camera].indices) for line in lines]
+    line = np.repeat(np.arange(len(lines)), [len(own) for own in pixels])
+    shape = len(lines), lines[0].images[camera].shape[1]
+    return sparse.csc_array((np.ones(len(line), bool), (line, np.concatenate(pixels))), shape=shape)
+
+
+def _lines(images: ParticleImages, weights: list[np.ndarray], places: list[np.ndarray]) -> list[_Line]:
+    lines = []
+    for start in range(0, len(places), AT_ONCE):
+        some = places[start : start + AT_ONCE]
+        found, information = [], []
+        for weight, own in zip(weights, images.lists(np.concatenate(some)), strict=True):
+            shape = (len(own.first) - 1, len(weight))
+            image = sparse.csr_array((own.values[:, 3].astype(float), own.pixel, own.first), shape=shape)
+            found.append(image)
+            information.append(image.power(2) @ weight)
+        every, first = np.maximum(np.stack(information, axis=1), 1e-30), 0
+        for positions in some:
+            own_places = slice(first, first + len(positions))
+            parts = [image[own_places] for image in found]
+            lines.append(_Line(positions_mm=positions, images=parts, information=every[own_places]))
+            first = own_places.stop
+    return lines
