@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -256,12 +257,13 @@ def run_chunks(
         job(0, 0, size)
         return
     edges = [size * part // chunks for part in range(chunks + 1)]
-    parts = [(part, edges[part], edges[part + 1]) for part in range(chunks) if edges[part + 1] > edges[part]]
-    waiting = iter(parts)
+    chosen = [part for part in range(chunks) if edges[part + 1] > edges[part]]
+    parts = [partial(job, part, edges[part], edges[part + 1]) for part in chosen]
+    waiting = iter(parts)  # a thread that is late still holds it: empty, it keeps none of the job's arrays
 
     def work() -> None:
         for part in waiting:
-            job(*part)
+            part()
 
     # The calling thread works, too. It wakes one thread for each other core: to hand over each part costs more time.
     helpers = [_pool.submit(work) for _ in range(min(where.threads, len(parts)) - 1)]
@@ -270,6 +272,5 @@ def run_chunks(
     finally:
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
-        del job  # a thread that is late still holds `work`, which must not keep the job's arrays
     for helper in begun:
         helper.result()

@@ -2,6 +2,8 @@
 
 import threading
 import time
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -103,3 +105,23 @@ def test_an_error_on_another_thread_reaches_the_caller(device, monkeypatch):
 
     with pytest.raises(ValueError, match="part"):
         runtime.run_chunks(2, job, chunks=2, warp_device="cpu")
+
+
+def test_a_thread_that_is_late_keeps_no_array(device, monkeypatch):
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=2))
+    late = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr(runtime, "_pool", pool)
+        pool.submit(late.wait, TIMEOUT_S)
+        array = np.zeros(10)
+
+        def job(part, first, last, own=array):
+            own[first:last] += 1
+
+        runtime.run_chunks(10, job, chunks=4, warp_device="cpu")
+        assert (array == 1).all()
+        known = weakref.ref(array)
+        del array, job
+        kept = known() is not None
+        late.set()
+    assert not kept
