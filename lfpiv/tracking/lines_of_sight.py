@@ -34,7 +34,7 @@ REFINED = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Line:
+class Line:
     """Places on a line of sight; the first one is that of the particle. Arrays have a row for each place."""
 
     positions_mm: np.ndarray
@@ -159,7 +159,7 @@ def _places(images: ParticleImages, weights: list[np.ndarray], cloud: Cloud) -> 
     return found
 
 
-def _crossing(lines: list[_Line], camera: int) -> sparse.csc_array:
+def _crossing(lines: list[Line], camera: int) -> sparse.csc_array:
     """Return which lines light which pixels of a camera, shape (line, pixel)."""
     pixels = [np.unique(line.images[camera].indices) for line in lines]
     line = np.repeat(np.arange(len(lines)), [len(own) for own in pixels])
@@ -167,7 +167,7 @@ def _crossing(lines: list[_Line], camera: int) -> sparse.csc_array:
     return sparse.csc_array((np.ones(len(line), bool), (line, np.concatenate(pixels))), shape=shape)
 
 
-def _lines(images: ParticleImages, weights: list[np.ndarray], places: list[np.ndarray]) -> list[_Line]:
+def _lines(images: ParticleImages, weights: list[np.ndarray], places: list[np.ndarray]) -> list[Line]:
     lines = []
     for start in range(0, len(places), AT_ONCE):
         some = places[start : start + AT_ONCE]
@@ -181,6 +181,6 @@ def _lines(images: ParticleImages, weights: list[np.ndarray], places: list[np.nd
         for positions in some:
             own_places = slice(first, first + len(positions))
             parts = [image[own_places] for image in found]
-            lines.append(_Line(positions_mm=positions, images=parts, information=every[own_places]))
+            lines.append(Line(positions_mm=positions, images=parts, information=every[own_places]))
             first = own_places.stop
     return lines

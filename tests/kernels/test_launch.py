@@ -3,7 +3,6 @@
 import threading
 import time
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -108,20 +107,27 @@ def test_an_error_on_another_thread_reaches_the_caller(device, monkeypatch):
 
 
 def test_a_thread_that_is_late_keeps_no_array(device, monkeypatch):
-    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=2))
-    late = threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        monkeypatch.setattr(runtime, "_pool", pool)
-        pool.submit(late.wait, TIMEOUT_S)
-        array = np.zeros(10)
+    many = 64  # more than threads of the processor
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=many))
+    begun, free = threading.Semaphore(0), threading.Event()
 
-        def job(part, first, last, own=array):
-            own[first:last] += 1
+    def wait(part, first, last):
+        begun.release()
+        free.wait(TIMEOUT_S)
 
-        runtime.run_chunks(10, job, chunks=4, warp_device="cpu")
-        assert (array == 1).all()
-        known = weakref.ref(array)
-        del array, job
-        kept = known() is not None
-        late.set()
-    assert not kept
+    blocker = threading.Thread(target=runtime.run_chunks, args=(many, wait), kwargs={"chunks": many})
+    blocker.start()
+    while begun.acquire(timeout=0.5):
+        pass  # until all threads wait
+    array = np.zeros(10)
+
+    def job(part, first, last, own=array):
+        own[first:last] += 1
+
+    runtime.run_chunks(10, job, chunks=4)
+    whole, known = (array == 1).all(), weakref.ref(array)
+    del array, job
+    kept = known() is not None
+    free.set()
+    blocker.join()
+    assert whole and not kept

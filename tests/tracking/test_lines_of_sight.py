@@ -5,8 +5,7 @@ import pytest
 from scipy import sparse
 from support.tracking_rig import READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
 
-from lfpiv.tracking import lines_of_sight
-from lfpiv.tracking.lines_of_sight import LARGEST_LACK, STEP_VOXEL, follow_lines
+from lfpiv.tracking.lines_of_sight import LARGEST_LACK, STEP_VOXEL, Line, follow_lines
 from lfpiv.tracking.particle_images import ParticleImages
 from lfpiv.tracking.refinement import Cloud, Scene, linearise, refine, rendered
 
@@ -130,7 +129,7 @@ def test_light_and_score_are_those_of_least_squares():
             targets[0] = targets[0] * (rng.random(pixels) > 0.6)  # lacks light
         left = [weight * target for weight, target in zip(weights, targets, strict=True)]
         information = np.stack([part**2 @ weight for part, weight in zip(parts, weights, strict=True)], axis=1)
-        line = lines_of_sight._Line(
+        line = Line(
             positions_mm=np.zeros((places, 3)),
             images=[sparse.csr_array(part) for part in parts],
             information=information,
