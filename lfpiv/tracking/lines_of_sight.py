@@ -38,6 +38,7 @@ class Line:
     """Places on a line of sight; the first one is that of the particle. Arrays have a row for each place."""
 
     positions_mm: np.ndarray
+    """Places (x, y, z) [mm], shape (place, 3)."""
     images: list[sparse.csr_array]
     """Images of particles of unit light by camera, shape (place, pixel)."""
     information: np.ndarray
@@ -168,16 +169,13 @@ def _crossing(lines: list[Line], camera: int) -> sparse.csc_array:
 
 
 def _lines(images: ParticleImages, weights: list[np.ndarray], places: list[np.ndarray]) -> list[Line]:
+    """Return the lines of such places."""
     lines = []
     for start in range(0, len(places), AT_ONCE):
         some = places[start : start + AT_ONCE]
-        found, information = [], []
-        for weight, own in zip(weights, images.lists(np.concatenate(some)), strict=True):
-            shape = (len(own.first) - 1, len(weight))
-            image = sparse.csr_array((own.values[:, 3].astype(float), own.pixel, own.first), shape=shape)
-            found.append(image)
-            information.append(image.power(2) @ weight)
-        every, first = np.maximum(np.stack(information, axis=1), 1e-30), 0
+        found, first = images.matrices(np.concatenate(some)), 0
+        information = [image.power(2) @ weight for image, weight in zip(found, weights, strict=True)]
+        every = np.maximum(np.stack(information, axis=1), 1e-30)
         for positions in some:
             own_places = slice(first, first + len(positions))
             parts = [image[own_places] for image in found]

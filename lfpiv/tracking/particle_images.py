@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 
 from lfpiv.weights.blocks import PackedCamera
 from lfpiv.weights.ray_fit import ray_models
@@ -61,6 +62,20 @@ class ParticleImages:
             self._kernels[name](ray_models(camera, positions_mm, self.voxel_mm), sigma)
             for name, camera in self.cameras.items()
         ]
+
+    def matrices(self, positions_mm: np.ndarray) -> list[sparse.csr_array]:
+        """Return for each camera the images of particles of unit light, shape (particle, pixel), float64.
+
+        Parameters
+        ----------
+        positions_mm : ndarray, shape (particle, 3)
+            Positions (x, y, z) [mm].
+        """
+        found = []
+        for own, pixels in zip(self.lists(positions_mm), np.diff(self.first_pixel), strict=True):
+            shape = len(positions_mm), int(pixels)
+            found.append(sparse.csr_array((own.values[:, 3].astype(float), own.pixel, own.first), shape=shape))
+        return found
 
 
 def _kernel(camera: CalibratedCamera) -> GaussianImages:

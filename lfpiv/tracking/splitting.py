@@ -61,10 +61,8 @@ def split(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal, ch
     positions, lights = [], []
     for number in np.flatnonzero(chosen):
         gain, excess, light = np.zeros(len(apart)), 0.0, []
-        for camera, own in enumerate(images.lists(cloud.positions_mm[number] + steps)):
+        for camera, values in enumerate(images.matrices(cloud.positions_mm[number] + steps)):
             span = slice(*images.first_pixel[camera : camera + 2])
-            shape = (len(steps), span.stop - span.start)
-            values = sparse.csr_array((own.values[:, 3].astype(float), own.pixel, own.first), shape=shape)
             one = values[[0]]
             there = one.indices
             target = residual[span].astype(float)
