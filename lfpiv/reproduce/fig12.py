@@ -12,8 +12,8 @@ import numpy as np
 from lfpiv import metrics
 from lfpiv.metrics.particles import PEAK_SHARE
 from lfpiv.progress import Progress
-from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce.voxels import Voxels, demanded
 from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
 from lfpiv.weights.operator import Weights
@@ -29,6 +29,8 @@ PAPER_Q = 0.75
 GOAL_Q = 0.80
 POINTS_PPM = {"small": (0.1, 0.5, 1.0), "paper": PPM["paper"]}
 """Seeding at which points are reconstructed too, by the network."""
+SIZE_PPM = 0.5
+"""Seeding of the images that the particles' size is measured in."""
 TRUTH_PPM = 0.5
 """Seeding at which SMART also starts from the true particles, to test whether the images distinguish ghosts."""
 DARK_SHARE = 1e-3
@@ -49,8 +51,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no_sieve": {"sieve_voxel": 0.0},
 }
 """SMART settings of each kind of run that differ from the defaults. "paper" has the paper's number of iterations and
-relaxation. "no_sieve" reconstructs voxels instead of Gaussians of the particles' size. Particles are blobs, in "points"
-they are points."""
+relaxation, and its voxels: no finer ones, none beyond the volume. "no_sieve" reconstructs voxels instead of Gaussians of
+the particles' size. Particles are blobs, in "points" they are points."""
 CORRELATED_VOXEL = Correlation().smoothing_voxel
 """Smoothing before the correlation, the sieve's included [voxel]. Q is reported of volumes smoothed like this too."""
 
@@ -106,25 +108,47 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
         "smart": Smart().model_dump(),
         "correlated_voxel": CORRELATED_VOXEL,
     }
-    built: dict[str, Weights] = {}
+
+    def recorded(ppm: float, blob_voxel: float) -> dict[str, np.ndarray]:
+        return rigs.particle_images(rig, _positions(size, ppm, seed), _stream(ppm, seed), blob_voxel=blob_voxel)
+
+    voxels = {"paper": Voxels(grid)}
+    for kind in ("blobs", "points"):
+        blob = _blob_voxel(kind)
+        voxels[kind] = demanded(
+            rig, grid, work / f"size_{kind}.npz", {**settings, "kind": kind}, lambda blob=blob: recorded(SIZE_PPM, blob)
+        )
+    built: dict[tuple[str, Voxels], Weights] = {}
     runs, found = [], {}
     jobs = _jobs(scale)
     for done, job in enumerate(jobs):
 
         def compute(job: Job = job, done: int = done) -> dict[str, Any]:
-            if job.mapping not in built:
+            mine = voxels[_voxels_of(job.kind)]
+            if (job.mapping, mine) not in built:
                 built.clear()  # one set of weights at a time: memory
-                built[job.mapping] = rig.weights(grid, job.mapping)
-            blob = 0.0 if job.kind == "points" else rigs.BLOB_VOXEL
-            positions = _positions(size, job.ppm, seed)
-            images = rigs.particle_images(rig, positions, _stream(job.ppm, seed), blob_voxel=blob)
+                built[job.mapping, mine] = mine.weights(rig, job.mapping)
             smart = Smart.model_validate({**Smart().model_dump(), **VARIANTS[job.kind]})
             step = _part(progress, "reconstruction", done, len(jobs))
-            return _judge(built[job.mapping], images, positions, smart, job.kind == "from_truth", step)
+            return _judge(
+                mine,
+                built[job.mapping, mine],
+                recorded(job.ppm, _blob_voxel(job.kind)),
+                _positions(size, job.ppm, seed),
+                smart,
+                job.kind == "from_truth",
+                step,
+            )
 
         figures = store.cached_arrays(
             work / f"{job.kind}_{job.mapping}_{job.ppm:.2f}.npz",
-            {**settings, "ppm": job.ppm, "kind": job.kind, **VARIANTS[job.kind]},
+            {
+                **settings,
+                "ppm": job.ppm,
+                "kind": job.kind,
+                **VARIANTS[job.kind],
+                "refinement": voxels[_voxels_of(job.kind)].refinement,
+            },
             compute,
         )
         scalars = {key: value.tolist() for key, value in figures.items() if key not in ("found_mm", "peaks")}
@@ -143,12 +167,21 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
 
 def _jobs(scale: str) -> list[Job]:
-    """Return all volumes of a scale, sorted by their weights."""
+    """Return all volumes of a scale, those of the same weights one after the other."""
     jobs = [Job(mapping, ppm, "blobs") for mapping in MAPPINGS for ppm in PPM[scale]]
     jobs += [Job("network", ppm, kind) for ppm in PPM[scale] for kind in ("paper", "no_sieve")]
     jobs += [Job("network", TRUTH_PPM, "from_truth")]
     jobs += [Job("network", ppm, "points") for ppm in POINTS_PPM[scale]]
-    return sorted(jobs, key=lambda job: (job.mapping, job.ppm, job.kind))
+    return sorted(jobs, key=lambda job: (job.mapping, _voxels_of(job.kind), job.ppm, job.kind))
+
+
+def _voxels_of(kind: str) -> str:
+    """Return whose voxels a kind of run has: "paper", "points", or else "blobs"."""
+    return kind if kind in ("paper", "points") else "blobs"
+
+
+def _blob_voxel(kind: str) -> float:
+    return 0.0 if kind == "points" else rigs.BLOB_VOXEL
 
 
 def _stream(ppm: float, seed: int) -> list[int]:
@@ -203,6 +236,7 @@ def _result(groups: Mapping[str, Sequence[Mapping[str, Any]]], setup: Mapping[st
 
 
 def _judge(
+    voxels: Voxels,
     weights: Weights,
     images: Mapping[str, np.ndarray],
     positions_mm: np.ndarray,
@@ -210,11 +244,12 @@ def _judge(
     from_truth: bool,
     step: Callable[[float], None],
 ) -> dict[str, Any]:
-    truth, first = rigs.truth(positions_mm, weights.grid), None
+    truth, first = rigs.truth(positions_mm, voxels.volume), None
     if from_truth:  # dark voxels are not quite dark: ghosts may grow
         light = sum(float(image.sum(dtype=np.float64)) for image in images.values()) / len(images)
-        first = (truth.values + DARK_SHARE * float(truth.max())) * np.float32(light / float(truth.sum()))
-    result = reconstruct(weights, images, first=first, progress=step, **smart.of_one_frame())
+        start = rigs.truth(positions_mm, voxels.grid)
+        first = (start.values + DARK_SHARE * float(start.max())) * np.float32(light / float(start.sum()))
+    result = voxels.reconstruct(weights, images, smart, first=first, progress=step)
     quality = metrics.particle_quality(result, positions_mm)
     found = metrics.find_particles(result, quality.threshold)
     return {

@@ -16,8 +16,8 @@ from lfpiv import metrics
 from lfpiv.geometry.grid import AXES
 from lfpiv.metrics.vector_fields import BELOW_VOXEL
 from lfpiv.progress import Progress
-from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import angles, page, plots, rigs, store
+from lfpiv.reproduce.voxels import demanded
 from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation, Smart
 from lfpiv.simulation.flows import Ring
 from lfpiv.velocity import derived
@@ -101,6 +101,13 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
             fields |= _pack(vectors, name)
         return fields
 
+    voxels = demanded(
+        rig,
+        grid,
+        work / "size.npz",
+        settings,
+        lambda: _images(rig, work, settings, SHOWN_PPM, 0, frames(SHOWN_PPM)[0]),
+    )
     fields: dict[tuple[str, float], Fields] = {}
     todo = [(mapping, ppms) for mapping in ("truth", *MAPPINGS)] + [(mapping, (SHOWN_PPM,)) for mapping in TURNED]
     total, done = sum(len(several) for _, several in todo), 0
@@ -114,17 +121,18 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
                 if mapping == "truth":
                     return correlated([rigs.truth(positions, grid) for positions in frames(ppm)])
                 if built is None:
-                    built = rig.weights(grid, mapping)
+                    built = voxels.weights(rig, mapping)
                 volumes, quality = [], []
                 for number, positions in enumerate(frames(ppm)):
                     images = _images(rig, work, settings, ppm, number, positions)
-                    volumes.append(reconstruct(built, images, **smart.of_one_frame()))
+                    volumes.append(voxels.reconstruct(built, images, smart))
                     quality.append(metrics.reconstruction_quality(volumes[-1], rigs.truth(positions, grid)))
                     progress("volumes and vectors", (done + 0.4 * (number + 1)) / total)
                 return {**correlated(volumes), "q": np.array(quality)}
 
             path = work / f"vectors_{mapping}_{ppm:.2f}.npz"
-            fields[mapping, ppm] = store.cached_arrays(path, {**settings, "ppm": ppm, "mapping": mapping}, compute)
+            asked = {**settings, "ppm": ppm, "mapping": mapping, "refinement": voxels.refinement}
+            fields[mapping, ppm] = store.cached_arrays(path, asked, compute)
             done += 1
     for path in work.glob("images_*.npz"):  # large, and not needed once all vectors are computed
         path.unlink()

@@ -112,10 +112,15 @@ class Rig:
             raise ValueError(f"{name}: expected a camera calibrated from a board, got one without dots.")
         return dots
 
-    def weights(self, grid: Grid, mapping: str, progress: StepProgress | None = None) -> Weights:
-        """Build the weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`."""
+    def weights(
+        self, grid: Grid, mapping: str, progress: StepProgress | None = None, particle_voxel: float = 0.0
+    ) -> Weights:
+        """Build the weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`.
+
+        `particle_voxel` is the size of the particles, as of `build_weights`.
+        """
         calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
-        return build_weights(calibration, grid, progress=progress)
+        return build_weights(calibration, grid, particle_voxel=particle_voxel, progress=progress)
 
     def ray_tracing(self, mapping: str) -> Calibration:
         """Return thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""
@@ -308,8 +313,8 @@ def reconstruct_images(
 
 
 def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:
-    """Return the particles as blobs on the voxels."""
-    return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL)
+    """Return the particles as blobs on the voxels, which may be finer than the paper's."""
+    return metrics.truth_volume(positions_mm, None, grid, BLOB_VOXEL * VOXEL_MM / grid.voxel_mm)
 
 
 def true_field(

@@ -1,6 +1,6 @@
 """Measure instants of time series that start from those before them (`smart.predict`) against instants by themselves.
 
-    python perf/accuracy/predicted_series.py --flows dns,swirl,turbulence,points --seeds 1,3
+    python perf/accuracy/predicted_series.py [--scale small|paper] --flows dns,swirl,turbulence,points --seeds 1,3
 
 Flows are the DNS series of `dns_series`, the same with realistic images, a swirl and a frozen turbulence of blobs, and
 the turbulence of points. Each instant is reconstructed in both ways, one after the other, in one process, and the
@@ -49,23 +49,23 @@ TURBULENCE = {"rms_mm": 0.1, "integral_scale_mm": 0.8, "smallest_mm": 0.8}
 STILL = {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)}
 
 
-def scene_of(flow: str, seed: int) -> Scene:
+def scene_of(flow: str, seed: int, scale: str) -> Scene:
     """Return the series of a flow; the rig differs with the seed."""
     if flow == "dns":
-        return dns_series.series_scene("small", seed)
+        return dns_series.series_scene(scale, seed)
     if flow == "realistic":
-        return realistic(dns_series.series_scene("small", seed))
-    tables = imperfect_scenes.ideal_tables("small", seed)
+        return realistic(dns_series.series_scene(scale, seed), scale)
+    tables = imperfect_scenes.ideal_tables(scale, seed)
     tables["particles"] = (POINTS if flow == "points" else BLOBS) | {"instants": INSTANTS, "step": 1}
     if flow != "swirl":
         tables |= {"flow": STILL, "turbulence": TURBULENCE}
     return Scene.model_validate(tables)
 
 
-def realistic(scene: Scene) -> Scene:
+def realistic(scene: Scene, scale: str) -> Scene:
     """Return a series with all imperfections of the images, of board and lens arrays; the cameras have not moved."""
     tables = scene.model_dump(exclude_unset=True)
-    for name, table in imperfect_scenes.rows("small")["all"].tables.items():
+    for name, table in imperfect_scenes.rows(scale)["all"].tables.items():
         if name != "particles":  # those of the series
             tables[name] = tables[name] | table if isinstance(tables.get(name), dict) else table
     return Scene.model_validate(tables)
@@ -111,12 +111,11 @@ def timed_parts(seconds: dict[str, list[float]]) -> Iterator[None]:
 
 
 @contextmanager
-def series_work(flow: str, seed: int, folder: Path) -> Iterator[PairWork]:
-    """Yield the work on a series, simulated and calibrated if `folder` does not hold it yet."""
-    data = folder / f"{flow}_{seed}"
+def series_work(scene: Scene, data: Path) -> Iterator[PairWork]:
+    """Yield the work on a series, simulated and calibrated if the folder `data` does not hold it yet."""
     path = data / "images" / "experiment.toml"
     if not path.exists():
-        simulate(scene_of(flow, seed), path.parent, progress=lambda step, fraction: None)
+        simulate(scene, path.parent, progress=lambda step, fraction: None)
     experiment = open_experiment(path)
     with open_run(experiment, data / "run", "cpu", None) as run:
         run, prepared = rig.prepare(run, rig.calibrate(run).calibration)
@@ -182,13 +181,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flows", default=",".join(FLOWS), help=", ".join(FLOWS))
     parser.add_argument("--seeds", default="1,3")
+    parser.add_argument("--scale", default="small", choices=["small", "paper"], help="size of volume and sensors")
     parser.add_argument("--folder", type=Path, default=Path("predicted_series"), help="for images and calibrations")
     options = parser.parse_args()
     for flow in options.flows.split(","):
         for seed in map(int, options.seeds.split(",")):
-            with series_work(flow, seed, options.folder) as work:
-                found = measure(scene_of(flow, seed), work)
-            print(f"{flow}, seed {seed}")
+            scene = scene_of(flow, seed, options.scale)
+            with series_work(scene, options.folder / f"{options.scale}_{flow}_{seed}") as work:
+                found = measure(scene, work)
+            print(f"{flow}, seed {seed}, {options.scale}")
             for name in found["predicted"] | found["alone"]:
                 alone, predicted = (found[way].get(name, 0.0) for way in ("alone", "predicted"))
                 ratio = predicted / alone if alone else float("nan")
