@@ -7,6 +7,7 @@ light by their brightness: a window of them is as bright as one of particles tha
 from __future__ import annotations
 
 import numpy as np
+from scipy import stats
 
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation.light import shared_light
@@ -16,6 +17,9 @@ MOVING_VOXEL = 1.0
 """Least displacement of vectors that moving particles made [voxel]."""
 BRIGHTER = 1.5
 """Least light of a window that stays in place, as a multiple of the median light of windows in which particles move."""
+SCATTERS = 4.0
+"""Least excess of that light over the median, in robust standard deviations of the light of windows in which particles
+move: of few particles to a window, some windows hold several times as many."""
 LEAST_MOVING = 0.25
 """Least share of vectors that must move for their light to be a measure."""
 
@@ -39,8 +43,8 @@ def on_standing_light(
     Returns
     -------
     ndarray of bool, shape (z, y, x)
-        True where at least `BRIGHTER` times the light of moving particles stays in place. False everywhere if less than
-        `LEAST_MOVING` of the vectors move.
+        True where at least `BRIGHTER` times the light of moving particles stays in place, and more than its scatter
+        explains. False everywhere if less than `LEAST_MOVING` of the vectors move.
     """
     speed = np.linalg.norm(field, axis=-1)
     moving = valid & (speed >= MOVING_VOXEL)
@@ -49,6 +53,8 @@ def on_standing_light(
         return none
     least, mean = shared_light(first, second)
     staying = windows.means(least)
-    typical = float(np.median(windows.means(mean)[moving]))
-    bright: np.ndarray = staying >= BRIGHTER * typical
+    light = windows.means(mean)[moving]
+    typical = float(np.median(light))
+    scatter = float(stats.median_abs_deviation(light, scale="normal"))
+    bright: np.ndarray = staying >= max(BRIGHTER * typical, typical + SCATTERS * scatter)
     return valid & bright if typical > 0 else none

@@ -21,10 +21,10 @@ def particles(points, brightness):
     return volume
 
 
-def volumes(shift, seed=1):
+def volumes(shift, seed=1, count=700):
     """Two volumes of the same particles, moved by `shift(points)`, which returns (n, 3)."""
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-3, np.array(SHAPE) + 3, (700, 3))
+    points = rng.uniform(-3, np.array(SHAPE) + 3, (count, 3))
     light = rng.lognormal(0, 0.5, len(points))
     half = shift(points) / 2
     return particles(points - half, light), particles(points + half, light)
@@ -65,6 +65,20 @@ def test_slow_flow_stays_valid():
     speed = np.abs(vectors["displacement_x"].values)
     assert (speed < 0.3).mean() > 0.3 and (speed > 1).mean() > 0.25
     assert vectors["valid"].values[speed < 0.3].mean() > 0.95
+
+
+THIN = 120  # particles: some three to a window, so that one in eight windows at rest holds twice the median
+
+
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_windows_that_hold_more_of_few_particles_at_rest_are_no_standing_light(seed):
+    windows = Windows.covering(SHAPE, (12, 12, 12), (6, 6, 6))
+    still = volumes(lambda points: 0 * points, seed, THIN)
+    field = np.zeros((*windows.count, 3))
+    field[..., 2] = np.where(np.arange(windows.count[2]) < 3, 0.0, 2.0)
+    valid = np.ones(windows.count, bool)
+    at_rest = (slice(None), slice(None), slice(0, 3))
+    assert on_standing_light(*still, windows, field, valid)[at_rest].mean() < 0.05
 
 
 def test_what_light_is_standing(bar):
