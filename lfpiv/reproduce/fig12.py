@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no_sieve": {"sieve_voxel": 0.0},
 }
 """SMART settings of each kind of run that differ from the defaults. "paper" has the paper's number of iterations and
-relaxation, and its voxels: no finer ones, none beyond the volume. "no_sieve" reconstructs voxels instead of Gaussians of
-the particles' size. Particles are blobs, in "points" they are points."""
+relaxation, and its voxels: no finer ones, none beyond the volume. "no_sieve" reconstructs voxels instead of Gaussians
+of the particles' size. Particles are blobs, in "points" they are points."""
 CORRELATED_VOXEL = Correlation().smoothing_voxel
 """Smoothing before the correlation, the sieve's included [voxel]. Q is reported of volumes smoothed like this too."""
 
@@ -114,10 +115,8 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
 
     voxels = {"paper": Voxels(grid)}
     for kind in ("blobs", "points"):
-        blob = _blob_voxel(kind)
-        voxels[kind] = demanded(
-            rig, grid, work / f"size_{kind}.npz", {**settings, "kind": kind}, lambda blob=blob: recorded(SIZE_PPM, blob)
-        )
+        images = partial(recorded, SIZE_PPM, _blob_voxel(kind))
+        voxels[kind] = demanded(rig, grid, work / f"size_{kind}.npz", {**settings, "kind": kind}, images)
     built: dict[tuple[str, Voxels], Weights] = {}
     runs, found = [], {}
     jobs = _jobs(scale)

@@ -1,4 +1,4 @@
-"""Voxels that the cases reconstruct: with a layer beyond each face, and as fine as the particles demand, as in a run."""
+"""Voxels that the cases reconstruct, as in a run: a layer beyond each face, and as fine as the particles demand."""
 
 from __future__ import annotations
 
