@@ -141,8 +141,9 @@ def run(scale: str, work: Path, *, seed: int = 0, progress: Progress) -> dict[st
         "smart": smart.model_dump(),
         "correlation": {**correlation, "windows": SCHEDULES},
         "mapping_error_pitch": rigs.mapping_errors_pitch(rig, grid, seed),
+        "refinement": voxels.refinement,
     }
-    return _result(fields, ppms, flow, setup, work)
+    return _result(fields, ppms, flow, setup, voxels.text, work)
 
 
 def _images(
@@ -177,6 +178,7 @@ def _result(
     ppms: tuple[float, ...],
     flow: Ring,
     setup: Mapping[str, Any],
+    reconstructed: str,
     work: Path,
 ) -> dict[str, Any]:
     judged = Judged([row for key, packed in fields.items() for row in _rows(key, packed, fields, flow)], ppms)
@@ -208,6 +210,7 @@ def _result(
         notes=[
             f"The ring's core line has a radius of {flow.radius_mm:g} mm; displacements reach {peak:.2f} voxel at "
             f"{flow.core_mm:.2g} mm from it and follow (r / l) exp(1 - r / l), r the distance from that line.",
+            reconstructed,
             *NOTES,
             angles.describe(by_angle, stretched, judged.contrast, GOAL_CONTRAST, SHOWN_PPM),
         ],

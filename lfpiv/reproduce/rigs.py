@@ -284,9 +284,8 @@ def reconstruct_images(
     *,
     floor: float | None = None,
     first: np.ndarray | None = None,
-    refinement: float = 1.0,
 ) -> xr.DataArray:
-    """Reconstruct a volume from raw images by SMART, as `lfpiv run` does.
+    """Reconstruct a volume from raw images by SMART on the voxels of its weights.
 
     Parameters
     ----------
@@ -300,16 +299,12 @@ def reconstruct_images(
         Noise floor of all images [count]. Default: measured in each image.
     first : ndarray, shape (z, y, x), optional
         First guess. Default: SMART's own.
-    refinement : float
-        Edge of the voxel in which `smart` states lengths over that of the weights' voxels.
     """
     light, noise = {}, {}
     for name, camera in weights.cameras.items():
         level, noise[name] = camera.decoder.background(images[name])
         light[name] = images[name] - np.float32(level)
-    return reconstruct(
-        weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame(refinement)
-    )
+    return reconstruct(weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame())
 
 
 def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:

@@ -41,9 +41,19 @@ class Voxels:
         """Grid of the reconstructed voxels."""
         return self.volume.padded(self.layers).refined(self.refinement)
 
+    @property
+    def text(self) -> str:
+        """What was reconstructed, for the page of a case."""
+        return (
+            f"Volumes are reconstructed as in a run, on voxels of {self.grid.voxel_mm:.3g} mm with a layer beyond each "
+            f"face, and judged on those of {self.volume.voxel_mm:g} mm."
+        )
+
     def weights(self, rig: Rig, mapping: str) -> Weights:
         """Build the weights of the reconstructed voxels; see `Rig.weights` for the mapping."""
-        return rig.weights(self.grid, mapping, particle_voxel=self.particle_voxel * self.refinement)
+        built = rig.weights(self.grid, mapping, particle_voxel=self.particle_voxel * self.refinement)
+        built.volume = self.volume
+        return built
 
     def reconstruct(
         self,
