@@ -232,7 +232,7 @@ def _result(
         notes=[
             "ppm: particles per microlens of the volume's x-y face.",
             f"SMART as this software runs it by default: at most {Smart().iterations} iterations.",
-            f"{reconstructed} The paper's SMART has the latter voxels alone.",
+            f"{reconstructed} The paper's SMART reconstructs these voxels themselves.",
             *NOTES,
             _verdict(q_mean["network"], groups["network"], groups["no_sieve"], groups["from_truth"][0]),
         ],

@@ -43,10 +43,10 @@ class Voxels:
 
     @property
     def text(self) -> str:
-        """What was reconstructed, for the page of a case."""
+        """Sentences that tell what was reconstructed, for the page of a case."""
         return (
             f"Volumes are reconstructed as in a run, on voxels of {self.grid.voxel_mm:.3g} mm with a layer beyond each "
-            f"face, and judged on those of {self.volume.voxel_mm:g} mm."
+            f"face. They are judged on voxels of {self.volume.voxel_mm:g} mm."
         )
 
     def weights(self, rig: Rig, mapping: str) -> Weights:
