@@ -4,7 +4,8 @@ A sub-aperture image has one pixel of every lens, those that see the same pupil 
 it shot noise. Its autocovariance is that of one particle's image times the mean square of the particles' light, at any
 seeding density (Campbell's theorem [1]_). So the ratio of the covariance one lens away to that at the same lens depends
 on the particles' size only. Images of random voxels, blurred by Gaussians of known sizes and projected with the
-weights, give the ratio for each size.
+weights, give the ratio for each size. These voxels lie in the volume and not in the guard layers, as the particles do:
+the light that ends at the volume's faces adds to the covariance one lens away.
 
 Noise of different pixels is independent, so a pixel is never multiplied with itself but with a neighbour in the pupil.
 That neighbour lies across the direction in which the two lenses lie. So a particle's depth shifts its image by the same
@@ -22,12 +23,13 @@ a whose logarithm has the standard deviation s.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.lightfield.microimage_layout import microimage_centres
@@ -42,6 +44,10 @@ SPARSITY = 128
 """Number of voxels per lit one in the volumes of known particle size."""
 LEAST_LIT = 64
 """Least number of lit voxels in these volumes."""
+KNOWN_VOXELS = 1 << 17
+"""Least number of voxels in all volumes of one known size. A small volume is lit again and again, at other places."""
+MOST_DRAWS = 4
+"""Largest number of volumes of one known size."""
 SUB_APERTURES = 5
 """Number of sub-aperture images along each axis of the pupil."""
 PUPIL_SHARE = 0.6
@@ -50,6 +56,11 @@ MEAN_LENSES = 3.0
 """Standard deviation of the Gaussian over which the mean light is taken [lens]."""
 FAR_LENSES = (4, 5, 6)
 """Distances at which products show no particles any more, only light that varies slowly [lens]."""
+PROTRUDING_VOXEL = 0.93
+"""Standard deviation of the particles that protrude from an evenly lit volume [reconstructed voxel].
+
+Voxels are refined until particles are about as large, see `lfpiv.reconstruction.refinement`.
+"""
 LIT_SHARE = 0.1
 """Least light of a lens that counts, as a share of the brightest lens's light of an evenly lit volume."""
 LEAST_RANGE = 0.1
@@ -165,16 +176,34 @@ def _local_mean(light: np.ndarray) -> np.ndarray:
 
 
 def _evenly_lit(weights: Weights) -> np.ndarray:
-    """Return a volume (z, y, x) whose voxels are lit evenly, but not the guard layers, which users do not see."""
+    """Return the mean volume (z, y, x) of particles whose centres fill the volume evenly.
+
+    Particles at the volume's faces protrude into the guard layers, which are dark beyond that.
+    """
     if weights.volume == weights.grid:
         return np.ones(weights.grid.shape, np.float32)
+    width = PROTRUDING_VOXEL * weights.grid.voxel_mm
     z, y, x = (
-        np.abs(weights.grid.axis_mm(axis) - weights.volume.centre_mm[2 - axis])
-        <= weights.volume.shape[axis] * weights.volume.voxel_mm / 2
-        for axis in range(3)
+        special.ndtr((half + from_centre) / width) - special.ndtr((from_centre - half) / width)
+        for from_centre, half in _from_centre_mm(weights)
     )
-    lit: np.ndarray = z[:, None, None] & y[:, None] & x
+    lit: np.ndarray = z[:, None, None] * y[:, None] * x
     return lit.astype(np.float32)
+
+
+def _inside(weights: Weights) -> np.ndarray:
+    """Return the flat indices of the voxels whose centres lie in the volume, not in the guard layers."""
+    z, y, x = (np.abs(from_centre) <= half for from_centre, half in _from_centre_mm(weights))
+    return np.flatnonzero(z[:, None, None] & y[:, None] & x)
+
+
+def _from_centre_mm(weights: Weights) -> list[tuple[np.ndarray, float]]:
+    """Return the voxels' places from the volume's centre along z, y and x, and half the volume's edges."""
+    volume = weights.volume
+    return [
+        (weights.grid.axis_mm(axis) - volume.centre_mm[2 - axis], volume.shape[axis] * volume.voxel_mm / 2)
+        for axis in range(3)
+    ]
 
 
 class ParticleSizer:
@@ -197,19 +226,23 @@ class ParticleSizer:
         known = self._sub_apertures
         if even is not None:
             self._sub_apertures = {name: SubApertures(one, even[name]) for name, one in weights.cameras.items()}
-        size = weights.grid.size
-        lit = np.random.default_rng(0).choice(size, min(size, max(LEAST_LIT, size // SPARSITY)), replace=False)
-        points = np.zeros(size, np.float32)
-        points[lit] = 1.0
+        inside, random = _inside(weights), np.random.default_rng(0)
+        lit, draws = max(LEAST_LIT, inside.size // SPARSITY), min(math.ceil(KNOWN_VOXELS / inside.size), MOST_DRAWS)
+        known_volumes = np.zeros((draws, weights.grid.size), np.float32)
+        for points in known_volumes:
+            points[random.choice(inside, min(lit, inside.size), replace=False)] = 1.0
         ratios: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
         equal: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
         for width in WIDTHS_VOXEL:
-            images = weights(Sieve(width, weights.grid.shape)(points).reshape(weights.grid.shape), out=own)
-            for name, sub_apertures in known.items():
-                found = sub_apertures.fluctuations(images[name])
-                same, next_lens = found.covariances.sum(1)
+            sieve, seen = Sieve(width, weights.grid.shape), {name: list[Fluctuations]() for name in known}
+            for points in known_volumes:
+                images = weights(sieve(points).reshape(weights.grid.shape), out=own)
+                for name, sub_apertures in known.items():
+                    seen[name].append(sub_apertures.fluctuations(images[name]))
+            for name, found in seen.items():
+                same, next_lens = np.sum([one.covariances.sum(1) for one in found], axis=0)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
-                equal[name].append(_skewness(found.cumulants))
+                equal[name].append(_skewness(np.sum([one.cumulants for one in found], axis=0)))
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}
         """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising."""
         self._equal = equal

@@ -149,12 +149,13 @@ and as printed, the multiplicative first guess alone, refocused stacks, and the 
 
 
 def weights_of(rig: Rig, grid: Grid, particle_voxel: float = 0.0) -> Weights:
-    """Return the weights of a rig on a grid. Those of the last few rigs stay in memory."""
+    """Return the weights of a rig on a grid, which know its volume. Those of the last few rigs stay in memory."""
     key = (tuple(camera.model_dump_json() for camera in rig.cameras), grid, particle_voxel >= PARTICLE_VOXEL)
     if key not in _WEIGHTS:
         while len(_WEIGHTS) >= 2:
             _WEIGHTS.pop(next(iter(_WEIGHTS)))
         _WEIGHTS[key] = build_weights(rig.calibration, grid, particle_voxel=particle_voxel)
+    _WEIGHTS[key].volume = rig.grid
     return _WEIGHTS[key]
 
 

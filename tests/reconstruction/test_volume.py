@@ -19,7 +19,7 @@ from support.plain_rays import plain
 
 import lfpiv
 from lfpiv.calibration import coverage
-from lfpiv.reconstruction import momentum, particle_size, sieve, smart, steps
+from lfpiv.reconstruction import momentum, sieve, smart, steps
 from lfpiv.results import netcdf
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
@@ -35,7 +35,6 @@ TOLERANCE_F32 = 2e-4  # 50 iterations of float32 steps whose sums have <= 60 ter
 TOLERANCE_NEAR = 5e-3  # projections rounded by 6e-8 in differences of 1e-4 from the image, over 300 pixels
 TOLERANCE_RATIO = 1e-6  # logarithms up to 6 in float32, relative to a voxel's weights
 TOLERANCE_MISFIT = 1e-6  # a misfit is a float32 image's sum: rounding of 24 pixels relative to their light
-TOLERANCE_SIZE = 0.08  # [voxel] some hundred particles: a tenth of their covariance, a twentieth of its root
 TOLERANCE_NOISE = 0.1  # faint light adds to the noise of dark pixels, as in test_dark_noise
 TOLERANCE_LIMIT = 2e-3  # SMART converges linearly: what is left after 2,000 iterations in float32, 400 with momentum
 
@@ -438,64 +437,6 @@ def test_a_sharp_step_that_raises_the_misfit_is_taken_back(gain):
     misfits = [misfit.divergence for _, misfit in states]
     assert (np.diff(misfits) <= TOLERANCE_MISFIT * image.sum()).all()
     assert misfits[-1] < 0.7 * misfits[0]
-
-
-def traced_images(rig, positions, sigma_mm, seed, *, counts, noise=2.0, rays=2000):
-    """Images of particles by tracing rays from points of Gaussian clouds, and noise: no weights, no simulator."""
-    rng, images = np.random.default_rng(seed), {}
-    for name, camera in rig.cameras.items():
-        geometry = camera.optics
-        rows, columns = geometry.sensor_shape
-        points = np.repeat(positions, rays, axis=0)
-        points = points + sigma_mm * rng.standard_normal(points.shape)
-        radius, angle = geometry.pupil_radius_mm * np.sqrt(rng.random(len(points))), rng.random(len(points)) * 2 * np.pi
-        pupil = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        meets = camera.map(points, pupil)
-        lens = camera.lattice.centres_mm(camera.lattice.nearest(meets))
-        pixel = np.floor((lens + geometry.sensor_per_pupil * (meets - pupil)) / geometry.pixel_mm).astype(int)
-        pixel += (columns // 2, rows // 2)
-        inside = ((pixel >= 0) & (pixel < (columns, rows))).all(1)
-        light = np.bincount(pixel[inside, 1] * columns + pixel[inside, 0], minlength=rows * columns)
-        image = light * (250 * counts / rays) + noise * rng.standard_normal(rows * columns)  # 250 pixels a microimage
-        images[name] = image.reshape(rows, columns).astype(np.float32)
-    return images
-
-
-@pytest.fixture(scope="module")
-def small_volume():
-    rig = two_cameras(optics=optics(rows=460, columns=600))
-    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 1.8), voxel_mm=0.1)
-    return rig, lfpiv.build_weights(rig, grid)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sigma_voxel", "ppm", "counts"),
-    [(0.7, 0.2, 200.0), (0.7, 1.0, 200.0), (0.7, 0.5, 8.0), (1.0, 0.5, 200.0), (0.0, 0.2, 200.0), (0.0, 1.0, 8.0)],
-)
-def test_images_tell_how_large_particles_are(small_volume, sigma_voxel, ppm, counts):
-    """Whatever their number and brightness; the voxel's own variance of 1/12 is the weights' and does not count."""
-    rig, weights = small_volume
-    rng = np.random.default_rng([round(10 * sigma_voxel), round(10 * ppm)])
-    positions = rng.uniform(-0.5, 0.5, (round(400 * ppm), 3)) * (2.0, 2.0, 1.8)
-    images = traced_images(rig, positions, sigma_voxel * 0.1, 1, counts=counts)
-    sizer = particle_size.ParticleSizer(weights)
-    size = sizer.size(sizer.fluctuations(images))
-    assert size == pytest.approx(np.sqrt(max(sigma_voxel**2 - 1 / 12, 0)), abs=TOLERANCE_SIZE)
-    volume = plain_steps.reconstruct(weights, images, iterations=1, sieve_voxel="auto")
-    if sigma_voxel:
-        assert volume.sieve_voxel == pytest.approx(np.sqrt(size**2 - 1 / 12), abs=particle_size.SIEVE_STEP_VOXEL / 2)
-    else:  # points: plain SMART, bit for bit
-        assert volume.sieve_voxel == 0.0
-        assert volume.values.tobytes() == plain_steps.reconstruct(weights, images, iterations=1).values.tobytes()
-
-
-def test_images_of_noise_ask_for_no_sieve(small_volume):
-    rig, weights = small_volume
-    images = traced_images(rig, np.zeros((1, 3)), 0.1, 2, counts=0.0)
-    sizer = particle_size.ParticleSizer(weights)
-    seen = sizer.fluctuations(images)
-    assert sizer.size(seen) is None and sizer.matching_sieve(seen) == 0.0
 
 
 def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated():
