@@ -45,8 +45,8 @@ SAMPLED = (f"{PASSES}.projector_gpu",)
 """Modules whose kernels take most of the time. No launch's accesses depend on their results."""
 MODULES = (
     *SAMPLED,
-    *(f"{PASSES}.{name}" for name in ("blur_gpu", "depth_planes_gpu", "first_guess", "pixel_rays_gpu", "sums")),
-    *(f"{PASSES}.{name}" for name in ("update", "voxels")),
+    "lfpiv_kernels.filters.blur_gpu",
+    *(f"{PASSES}.{name}" for name in ("depth_planes_gpu", "first_guess", "pixel_rays_gpu", "sums", "update", "voxels")),
 )
 """Modules whose kernels a reconstruction launches on a GPU."""
 SIEVE_VOXEL = 0.6

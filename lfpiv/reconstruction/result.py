@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import MASKED, VIEWS
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.shared_light import SMOOTHING_VOXEL
-from lfpiv_kernels.correlation import deform
+from lfpiv_kernels.correlation import deform, light
 
 
 class SmartStop(enum.Enum):
@@ -59,8 +58,7 @@ class Reconstruction:
     @property
     def blurred(self) -> np.ndarray:
         """The volume smoothed by the size of a particle, in which instants are compared, float32."""
-        blurred: np.ndarray = ndimage.gaussian_filter(self.volume, SMOOTHING_VOXEL, mode="constant")
-        return blurred
+        return light.smoothed(self.volume, SMOOTHING_VOXEL)
 
     @cached_property
     def spline(self) -> np.ndarray:

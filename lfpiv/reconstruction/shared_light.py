@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.validation import fill
-from lfpiv_kernels.correlation import deform
+from lfpiv_kernels.correlation import deform, light
 from lfpiv_kernels.correlation.carry import carry
 
 SMOOTHING_VOXEL = 0.7
@@ -53,23 +53,23 @@ def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list
         Each with the light of its volume, zero where that is zero.
     """
     values = [np.asarray(volume.values, np.float32) for volume in volumes]
-    light = [float(value.sum(dtype=np.float64)) for value in values]
+    total = [float(value.sum(dtype=np.float64)) for value in values]
     coefficients = [deform.spline_coefficients(value) for value in values]
     motion = MotionField(volumes[0], vectors)
     guesses = []
     for number, own in enumerate(values):
         field = motion.displacement(1 if number == 0 else -1)
         partner, inside = motion.carried(coefficients[1 - number], field)
-        partner *= np.float32(light[number] / light[1 - number])
+        partner *= np.float32(total[number] / total[1 - number])
         guess = own * _gain(own, np.maximum(partner, 0)) ** (motion.trust * inside)
         np.maximum(guess, FAINTEST * guess.max(), out=guess, where=own > 0)
-        guesses.append(guess * np.float32(light[number] / guess.sum(dtype=np.float64)))
+        guesses.append(guess * np.float32(total[number] / guess.sum(dtype=np.float64)))
     return guesses
 
 
 def _gain(own: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """Return the factor that changes a volume's brightness; `partner` is the other one, carried to its instant."""
-    own, partner = (ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant") for volume in (own, partner))
+    own, partner = (light.smoothed(volume, SMOOTHING_VOXEL) for volume in (own, partner))
     dark = np.float32(DARK_SHARE * np.square(own, dtype=np.float64).sum() / own.sum(dtype=np.float64))
     return np.minimum((partner + dark) / (own + dark), np.float32(LARGEST_GAIN))
 

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv_kernels.reconstruction.blur import GaussianBlur
+from lfpiv_kernels.filters.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.voxels import divide, multiply
 from lfpiv_kernels.transfer import DeviceArray, Given, duplicate, to_device, to_host
 

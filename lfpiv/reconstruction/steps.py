@@ -24,7 +24,7 @@ from typing import Protocol
 
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
-from lfpiv_kernels.reconstruction.blur import GaussianBlur
+from lfpiv_kernels.filters.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.update import Leap, sharpen, update
 from lfpiv_kernels.reconstruction.voxels import divide, multiply
 from lfpiv_kernels.transfer import DeviceArray, empty

@@ -12,11 +12,11 @@ removes. With x a quarter of a voxel beside them the phases are 1/4 -+ d/2, and 
 
 import numpy as np
 import warp as wp
-from scipy import ndimage
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation import deform_gpu, filters_gpu
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
+from lfpiv_kernels.filters import spline
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.transfer import Given, Values, as_given, to_device, to_host
 
@@ -96,7 +96,8 @@ def spline_coefficients(volume: Given) -> Given:
     """
     if runtime.device().form == "gpu":
         return as_given(filters_gpu.spline_coefficients(on_device(volume), MARGIN), volume)
-    return as_given(ndimage.spline_filter(np.pad(to_host(volume), MARGIN), order=3, output=np.float32), volume)
+    padded = np.pad(to_host(volume), MARGIN)
+    return as_given(spline.prefilter(padded.shape)(padded.ravel()).reshape(padded.shape), volume)
 
 
 def deform_pair(first: Given, second: Given, field: Values, spacing: tuple[float, float, float]) -> tuple[Given, Given]:

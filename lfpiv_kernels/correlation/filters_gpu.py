@@ -1,7 +1,6 @@
 """Separable filters of volumes on a GPU: sums of voxels times taps, along one axis after the other.
 
-On the CPU SciPy filters recursively, row by row. A GPU has a thread for every voxel instead: neighbouring threads read
-neighbouring voxels along each axis, and no voxel waits for the one before it.
+A GPU has a thread for every voxel: neighbouring threads read neighbouring voxels along each axis.
 """
 
 import functools
@@ -13,6 +12,7 @@ import warp as wp
 from lfpiv_kernels import native
 from lfpiv_kernels.correlation.memory import empty_volume
 from lfpiv_kernels.correlation.plan import Triple
+from lfpiv_kernels.filters import blur, spline
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.transfer import to_device
 
@@ -24,15 +24,6 @@ WHOLE = wp.constant(1)
 """A sum that leaves the volume is 0."""
 REFLECTED = wp.constant(2)
 """The volume is continued by its image in its faces, as by SciPy's mode "reflect"."""
-MIRRORED = wp.constant(3)
-"""The volume is continued by its image in its outermost voxels, as by SciPy's mode "mirror"."""
-
-POLE = math.sqrt(3) - 2
-"""Pole of the recursive filter from the values of a cubic B-spline to its coefficients."""
-SPLINE_REACH = 14
-"""Voxels on either side that enter a coefficient: the share of those beyond is ``|POLE|**14``, 1e-8."""
-GAUSSIAN_REACH = 4.0
-"""Voxels on either side that enter a Gaussian mean, in standard deviations: as in SciPy."""
 
 
 @wp.func
@@ -44,12 +35,6 @@ def _folded(at: int, size: int, border: int):
         if place < 0:
             place += 2 * size
         place = wp.min(place, 2 * size - 1 - place)
-    elif border == MIRRORED:
-        period = wp.max(2 * size - 2, 1)
-        place = at % period
-        if place < 0:
-            place += period
-        place = wp.min(place, period - place)
     return place
 
 
@@ -105,7 +90,7 @@ def filter_along(
     first : int
         Voxel of the first tap for sum 0; negative in the margin or outside.
     border : int
-        `ZEROS`, `WHOLE`, `REFLECTED` or `MIRRORED`.
+        `ZEROS`, `WHOLE` or `REFLECTED`.
     step, count : int
         Distance and number of the sums; default: one at each voxel.
     margin : int
@@ -130,18 +115,16 @@ def _on_device(taps: tuple[float, ...]) -> wp.array:
 
 def spline_coefficients(volume: wp.array, margin: int) -> wp.array:
     """Return the cubic B-spline coefficients of a volume with zeros around it."""
-    distance = np.abs(np.arange(-SPLINE_REACH, SPLINE_REACH + 1))
-    taps = math.sqrt(3) * POLE**distance
     for axis in (2, 1, 0):
         count = volume.shape[axis] + 2 * margin
-        first = -SPLINE_REACH - margin
-        volume = filter_along(volume, axis, taps, first, border=MIRRORED, count=count, margin=margin)
+        first = -spline.REACH - margin
+        volume = filter_along(volume, axis, spline.PROFILE, first, count=count, margin=margin)
     return volume
 
 
 def smoothed(volume: wp.array, sigma: float) -> wp.array:
     """Return a volume smoothed by a Gaussian; voxels outside count as 0."""
-    reach = int(GAUSSIAN_REACH * sigma + 0.5)
+    reach = int(blur.REACH * sigma + 0.5)
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     for axis in range(3):
         volume = filter_along(volume, axis, taps / taps.sum(), -reach)

@@ -8,6 +8,7 @@ from lfpiv_kernels.correlation import filters_gpu, voxelwise_gpu
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.correlation.plan import Triple
 from lfpiv_kernels.correlation.sums import means_and_squares
+from lfpiv_kernels.filters import blur
 from lfpiv_kernels.transfer import Given, as_given, to_host
 
 TINY = float(np.finfo(np.float32).tiny)
@@ -18,7 +19,8 @@ def smoothed(volume: Given, sigma: float) -> Given:
     """Smooth a volume by a Gaussian of a standard deviation [voxel]; voxels outside count as 0."""
     if runtime.device().form == "gpu":
         return as_given(filters_gpu.smoothed(on_device(volume), sigma), volume)
-    return as_given(ndimage.gaussian_filter(to_host(volume), sigma, mode="constant"), volume)
+    values = np.ascontiguousarray(to_host(volume), np.float32)
+    return as_given(blur.smoothing(sigma, values.shape)(values.ravel()).reshape(values.shape), volume)
 
 
 def powered(volume: Given, exponent: float | np.floating) -> Given:

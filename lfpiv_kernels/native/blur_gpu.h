@@ -1,4 +1,4 @@
-// Blur of a volume along one axis on a GPU, a lane for each voxel; see ``reconstruction/blur_gpu.py``.
+// Blur of a volume along one axis on a GPU, a lane for each voxel; see ``filters/blur_gpu.py``.
 #ifndef LFPIV_BLUR_GPU_H
 #define LFPIV_BLUR_GPU_H
 

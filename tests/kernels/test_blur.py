@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction.blur import GaussianBlur
+from lfpiv_kernels.filters.blur import GaussianBlur
 
 SHAPES = [(24, 19, 37), (3, 50, 5), (1, 1, 7), (9, 2, 130)]
 

@@ -93,7 +93,7 @@ def test_no_module_shows_warnings_of_the_compiler():
 @pytest.mark.slow
 def test_warnings_are_silent_and_errors_are_not(changed_options, capfd, tmp_path):
     runtime.start("cpu")
-    module = "lfpiv_kernels.reconstruction.blur"
+    module = "lfpiv_kernels.filters.blur"
     options = wp.get_module(module).options
     header = included(module)
     for line, wrong in (("#warning noise", False), ("#error broken", True)):

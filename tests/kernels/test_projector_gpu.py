@@ -6,8 +6,9 @@ from support.plain_rays import plain
 from support.random_blocks import VOXELS, matrix_of, random_blocks
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.reconstruction import blur_gpu, depth_planes_gpu, line_shares_gpu, pixel_rays_gpu
-from lfpiv_kernels.reconstruction.blur import GaussianBlur
+from lfpiv_kernels.filters import blur_gpu
+from lfpiv_kernels.filters.blur import GaussianBlur
+from lfpiv_kernels.reconstruction import depth_planes_gpu, line_shares_gpu, pixel_rays_gpu
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.line_shares import Layers, LineShares
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets

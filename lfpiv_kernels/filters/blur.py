@@ -1,16 +1,18 @@
-"""Warp: Gaussian blur of a volume along its three axes. Twin: ``scipy.ndimage.gaussian_filter``.
+"""Warp: the same blur of a volume along each of its three axes. Twin: ``scipy.ndimage.correlate1d``.
 
 Each thread blurs planes of the outermost axis, so its intermediate results stay in the caches. The loops are C++, see
 ``blur.h``. A GPU has ``blur_gpu``.
 """
 
+from functools import lru_cache
+
 import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
+from lfpiv_kernels.filters import blur_gpu
+from lfpiv_kernels.filters.blur_layout import Axis
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction import blur_gpu
-from lfpiv_kernels.reconstruction.blur_layout import Axis
 from lfpiv_kernels.reconstruction.voxels import parts_of
 from lfpiv_kernels.transfer import Given, as_given, empty, to_device
 
@@ -18,6 +20,8 @@ wp.set_module_options(native.options("blur.h", contract="fast"))
 
 BORDERS = ("constant", "nearest")
 """Beyond the volume: zero, or its outermost voxels continued."""
+REACH = 4.0
+"""Reach of the Gaussian that smooths volumes, as of SciPy's [standard deviation]."""
 FEWEST_VOXELS = 8192
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 
@@ -61,19 +65,17 @@ def _blur(
     _blur_plane(outer, middle, row, nearest, length, first_plane + wp.tid(), slot, volume, work_out, blurred_out)
 
 
-class GaussianBlur:
-    """Gaussian blur of flat volumes of one shape.
+class Blur:
+    """Symmetric filter of flat volumes of one shape, the same along each axis.
 
     Parameters
     ----------
-    sigma_voxel : float
-        Standard deviation, above 0 [voxel].
+    profile : ndarray, shape (tap,)
+        Its weights, odd in number and symmetric.
     shape : tuple of int
         Voxel counts, the axis of neighbours in memory last.
-    truncate : float
-        Reach of the Gaussian [standard deviation].
     border : {"constant", "nearest"}
-        Light beyond the volume: none, or that of its outermost voxels. With "constant" the blur is its own adjoint.
+        Light beyond the volume: none, or that of its outermost voxels. With "constant" the filter is its own adjoint.
 
     Raises
     ------
@@ -81,13 +83,9 @@ class GaussianBlur:
         If `border` is neither.
     """
 
-    def __init__(self, sigma_voxel: float, shape: tuple[int, int, int], *, truncate: float, border: str):
+    def __init__(self, profile: np.ndarray, shape: tuple[int, int, int], *, border: str):
         if border not in BORDERS:
             raise ValueError(f"border: expected one of {', '.join(BORDERS)}, got {border!r}.")
-        radius = int(truncate * sigma_voxel + 0.5)
-        offset = np.arange(-radius, radius + 1)
-        profile = np.exp(-(offset**2) / (2 * sigma_voxel**2))
-        profile /= profile.sum()
         self.shape = shape
         self._axes = [_axis(profile, size, border) for size in shape]
         self._row, self._nearest = profile.astype(np.float32), border == "nearest"
@@ -105,6 +103,31 @@ class GaussianBlur:
             call = Call(_blur, planes, inputs, [work, blurred], scratch=True)
             launch(call, parts=parts_of(volume.size, FEWEST_VOXELS))
         return as_given(blurred, volume)
+
+
+class GaussianBlur(Blur):
+    """Gaussian blur of flat volumes of one shape. Twin: ``scipy.ndimage.gaussian_filter``.
+
+    Parameters
+    ----------
+    sigma_voxel : float
+        Standard deviation, above 0 [voxel].
+    shape, border
+        As of `Blur`.
+    truncate : float
+        Reach of the Gaussian [standard deviation].
+    """
+
+    def __init__(self, sigma_voxel: float, shape: tuple[int, int, int], *, truncate: float, border: str):
+        radius = int(truncate * sigma_voxel + 0.5)
+        profile = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (2 * sigma_voxel**2))
+        super().__init__(profile / profile.sum(), shape, border=border)
+
+
+@lru_cache(maxsize=4)
+def smoothing(sigma_voxel: float, shape: tuple[int, int, int]) -> GaussianBlur:
+    """Return the blur that smooths volumes before they are compared; it reaches `REACH` and adds no light beyond."""
+    return GaussianBlur(sigma_voxel, shape, truncate=REACH, border="constant")
 
 
 def _axis(profile: np.ndarray, size: int, border: str) -> Axis:

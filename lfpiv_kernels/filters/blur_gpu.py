@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.filters.blur_layout import Axis
 from lfpiv_kernels.lanes import LANES, lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.blur_layout import Axis
 
 wp.set_module_options(native.options("blur_gpu.h", contract="fast"))
 

@@ -1,0 +1,1 @@
+"""Separable filters of volumes: Gaussian blurs, coefficients of splines (Warp)."""
