@@ -264,8 +264,7 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
     """
     own, light = plain.volume, float(plain.volume.sum(dtype=np.float64))
     motion = MotionField(plain.to_dataarray(), flow)
-    field = motion.displacement(-1)
-    moved, inside = motion.carried(deform.spline_coefficients(volume), field)
+    moved, inside = motion.carried(deform.spline_coefficients(volume), -1)
     np.maximum(moved, 0, out=moved)
     total = float(moved.sum(dtype=np.float64))
     if not (light > 0 and total > 0):

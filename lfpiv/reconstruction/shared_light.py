@@ -11,12 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from scipy import ndimage
 
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.validation import fill
 from lfpiv_kernels.correlation import deform, light
-from lfpiv_kernels.correlation.carry import carry
+from lfpiv_kernels.correlation.carry import carry, followed
 
 SMOOTHING_VOXEL = 0.7
 """Standard deviation of the Gaussian that smooths both volumes before they are compared [voxel]: about the size of a
@@ -28,8 +27,6 @@ LARGEST_GAIN = 3.0
 """Largest factor by which the other frame brightens a voxel."""
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
-FOLLOWED = 4
-"""Fixed-point steps that turn displacements midway in time into those of the particles of one frame."""
 
 
 def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:
@@ -58,8 +55,7 @@ def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list
     motion = MotionField(volumes[0], vectors)
     guesses = []
     for number, own in enumerate(values):
-        field = motion.displacement(1 if number == 0 else -1)
-        partner, inside = motion.carried(coefficients[1 - number], field)
+        partner, inside = motion.carried(coefficients[1 - number], 1 if number == 0 else -1)
         partner *= np.float32(total[number] / total[1 - number])
         guess = own * _gain(own, np.maximum(partner, 0)) ** (motion.trust * inside)
         np.maximum(guess, FAINTEST * guess.max(), out=guess, where=own > 0)
@@ -102,28 +98,17 @@ class MotionField:
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, shape (z, y, x)."""
 
-    def displacement(self, steps: int) -> np.ndarray:
-        """Return the displacement of what is at the control points of a frame to another one; (3, z, y, x) [voxel].
-
-        `steps` is 1 from the first frame to the second, -1 back, and any other number for a frame so many times as far.
-        """
-        points, spacing = self.midway.points, np.array(self.midway.spacing)[:, None, None, None]
-        start = np.stack(np.meshgrid(*points, indexing="ij"))
-        middle = moved = np.moveaxis(steps * self.midway.field.astype(float), -1, 0)
-        for _ in range(FOLLOWED):
-            halfway = (start + moved / 2) / spacing
-            moved = np.stack([ndimage.map_coordinates(part, halfway, order=1, mode="nearest") for part in middle])
-        return moved
-
     def carried(
-        self, coefficients: np.ndarray, field: np.ndarray, wanted: np.ndarray | None = None
+        self, coefficients: np.ndarray, steps: int, wanted: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Sample a volume, given by its spline coefficients, at x + field(x) for all voxels x.
+        """Carry a volume, given by its spline coefficients, to the instant of a frame `steps` frames before its own.
 
-        Returns its light, 0 outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. Both
-        are 0 where `wanted`, shape (z, y, x), is 0.
+        `steps` is negative for a frame after it. Returns the volume's light at the places of that frame's particles, 0
+        outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. Both are 0 where `wanted`,
+        shape (z, y, x), is 0.
         """
-        return carry(coefficients, np.moveaxis(field, 0, -1).astype(np.float32), self.midway.spacing, wanted)
+        field = followed(self.midway.control, self.midway.spacing, steps)
+        return carry(coefficients, field, self.midway.spacing, wanted)
 
 
 def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """A volume carried along a displacement field: sampled at x + d(x) for all voxels x, by cubic B-spline interpolation.
 
-The field is linear between its control points. Beside each value stands how far its place lies within the volume. Twin:
+The field is linear between its control points. Beside each value stands how far its place lies within the volume. A
+field of displacements midway in time is turned into that of one frame's particles first. Twin:
 ``scipy.ndimage.map_coordinates``.
 """
 
@@ -11,9 +12,12 @@ from lfpiv_kernels import native
 from lfpiv_kernels.correlation.deform import MARGIN
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.transfer import Given, as_given, to_device
+from lfpiv_kernels.transfer import Given, Values, as_given, to_device
 
 wp.set_module_options(native.options("deform.h", contract="fast"))
+
+ROUNDS = 4
+"""Fixed-point steps that turn displacements midway in time into those of the particles of one frame."""
 
 
 @wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
@@ -21,11 +25,43 @@ def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: f
 
 
 @wp.func
-def _at_column(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
-    """Interpolate the displacement at a control point along x between four along z and y."""
-    near = (1.0 - ty) * field[iz, iy, ix] + ty * field[iz, iy + 1, ix]
-    far = (1.0 - ty) * field[iz + 1, iy, ix] + ty * field[iz + 1, iy + 1, ix]
-    return (1.0 - tz) * near + tz * far
+def _between(field: wp.array3d(dtype=wp.vec3), z: float, y: float, x: float):
+    """Interpolate the displacement at a place in units of the control grid."""
+    iz = wp.min(int(z), field.shape[0] - 2)
+    iy = wp.min(int(y), field.shape[1] - 2)
+    ix = wp.min(int(x), field.shape[2] - 2)
+    tz = z - float(iz)
+    ty = y - float(iy)
+    tx = x - float(ix)
+    found = wp.vec3()
+    for k in range(2):
+        share = wp.where(k == 0, 1.0 - tx, tx)
+        near = (1.0 - ty) * field[iz, iy, ix + k] + ty * field[iz, iy + 1, ix + k]
+        far = (1.0 - ty) * field[iz + 1, iy, ix + k] + ty * field[iz + 1, iy + 1, ix + k]
+        found += share * ((1.0 - tz) * near + tz * far)
+    return found
+
+
+@wp.kernel
+def _follow(
+    # in
+    midway: wp.array3d(dtype=wp.vec3),  # displacement midway in time (z, y, x) [voxel]; a thread per control point
+    spacing: wp.vec3,  # distance of control points [voxel]
+    steps: float,  # factor of the displacement
+    rounds: int,
+    first_layer: int,
+    # out
+    moved_out: wp.array3d(dtype=wp.vec3),  # displacement of what is at a control point (z, y, x) [voxel]
+):
+    layer, y, x = wp.tid()
+    z = first_layer + layer
+    moved = steps * midway[z, y, x]
+    for _ in range(rounds):
+        fz = wp.clamp(float(z) + 0.5 * moved[0] / spacing[0], 0.0, float(midway.shape[0] - 1))
+        fy = wp.clamp(float(y) + 0.5 * moved[1] / spacing[1], 0.0, float(midway.shape[1] - 1))
+        fx = wp.clamp(float(x) + 0.5 * moved[2] / spacing[2], 0.0, float(midway.shape[2] - 1))
+        moved = steps * _between(midway, fz, fy, fx)
+    moved_out[z, y, x] = moved
 
 
 @wp.func
@@ -55,16 +91,7 @@ def _carry(
             carried_out[z, y, x] = 0.0
             inside_out[z, y, x] = 0.0
             return
-    fz = float(z) / spacing[0]
-    fy = float(y) / spacing[1]
-    fx = float(x) / spacing[2]
-    iz = wp.min(int(fz), field.shape[0] - 2)
-    iy = wp.min(int(fy), field.shape[1] - 2)
-    ix = wp.min(int(fx), field.shape[2] - 2)
-    tz = fz - float(iz)
-    ty = fy - float(iy)
-    tx = fx - float(ix)
-    moved = (1.0 - tx) * _at_column(field, iz, iy, ix, tz, ty) + tx * _at_column(field, iz, iy, ix + 1, tz, ty)
+    moved = _between(field, float(z) / spacing[0], float(y) / spacing[1], float(x) / spacing[2])
     pz = float(z) + moved[0]
     py = float(y) + moved[1]
     px = float(x) + moved[2]
@@ -74,9 +101,36 @@ def _carry(
     inside_out[z, y, x] = within * _share_inside(px, shape[2] - 2 * margin)
 
 
+def followed(midway: Values, spacing: tuple[float, float, float], steps: float) -> wp.array:
+    """Return the displacement of what is at the control points of a frame, from displacements midway in time.
+
+    Solves u(x) = steps * d(x + u(x) / 2) by `ROUNDS` fixed-point steps. Beyond the control points the field is
+    continued by the outermost ones.
+
+    Parameters
+    ----------
+    midway : array, shape (n_z, n_y, n_x), vectors of float32
+        Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
+    spacing : tuple of float
+        Distance of the control points, order (z, y, x) [voxel].
+    steps : float
+        Factor of the displacement: 1 to the next frame, -1 to the one before.
+
+    Returns
+    -------
+    wp.array, shape (n_z, n_y, n_x), vectors of float32
+        Displacement u at the control points [voxel], on the device.
+    """
+    field = to_device(midway, wp.vec3)
+    moved = empty_volume(field.shape, wp.vec3)
+    inputs = [field, wp.vec3(*spacing), float(steps), ROUNDS]
+    launch(Call(_follow, field.shape[0], inputs, [moved], inner=field.shape[1:]), parts=1)
+    return moved
+
+
 def carry(
     coefficients: Given,
-    field: np.ndarray,
+    field: Values,
     spacing: tuple[float, float, float],
     wanted: np.ndarray | None = None,
 ) -> tuple[Given, Given]:
@@ -86,7 +140,7 @@ def carry(
     ----------
     coefficients : array, float32
         `lfpiv_kernels.correlation.deform.spline_coefficients` of the volume.
-    field : ndarray, shape (n_z, n_y, n_x, 3), float32
+    field : ndarray, shape (n_z, n_y, n_x, 3), float32, or array of vectors on the device
         Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
@@ -106,11 +160,11 @@ def carry(
     ValueError
         If the control grid is too small.
     """
-    if field.shape[3:] != (3,) or min(field.shape[:3]) < 2:
+    if (isinstance(field, np.ndarray) and field.shape[3:] != (3,)) or min(field.shape[:3]) < 2:
         raise ValueError(f"field: expected shape (>= 2, >= 2, >= 2, 3), got {field.shape}.")
     shape = tuple(n - 2 * MARGIN for n in coefficients.shape)
     outputs = [empty_volume(shape) for _ in range(2)]
-    control = to_device(np.ascontiguousarray(field, np.float32), wp.vec3)
+    control = to_device(np.ascontiguousarray(field, np.float32) if isinstance(field, np.ndarray) else field, wp.vec3)
     mask = None if wanted is None else on_device(wanted)
     flat, shape_3i = on_device(coefficients).flatten(), wp.vec3i(*coefficients.shape)
     inputs = [flat, shape_3i, control, wp.vec3(*spacing), MARGIN, mask]

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.ndimage
+import warp as wp
 from support.particle_volumes import TOLERANCE_PEAK, particle_pair, ring, uniform
 
 from lfpiv_kernels import runtime
@@ -17,6 +18,7 @@ from lfpiv_kernels.correlation import (
     plan,
     transforms,
 )
+from lfpiv_kernels.transfer import to_device, to_host
 
 pytestmark = pytest.mark.usefixtures("device")
 
@@ -241,6 +243,23 @@ def test_a_carried_volume_is_the_spline_at_the_displaced_places():
     there = carry.carry(deform.spline_coefficients(volume), field, spacing, wanted)
     np.testing.assert_array_equal(there[0], np.where(wanted > 0, carried, 0))
     np.testing.assert_array_equal(there[1], np.where(wanted > 0, inside, 0))
+
+
+def test_displacements_midway_in_time_become_those_of_a_frame_s_particles():
+    """At u(x) = steps * d(x + u / 2), the field continued by its outermost control points."""
+    rng, spacing = np.random.default_rng(6), (4.0, 3.5, 3.0)
+    midway = scipy.ndimage.gaussian_filter(rng.normal(0, 30, (7, 6, 8, 3)), (1, 1, 1, 0)).astype(np.float32)
+    points = np.stack(np.meshgrid(*map(np.arange, midway.shape[:3]), indexing="ij")).astype(float)
+    control = to_device(midway, wp.vec3)
+    for steps in (1, -2):
+        moved = to_host(carry.followed(control, spacing, steps)).astype(float)
+        expected = steps * np.moveaxis(midway.astype(float), -1, 0)
+        for _ in range(carry.ROUNDS):
+            cell = points + expected / 2 / np.reshape(spacing, (3, 1, 1, 1))
+            sampled = [scipy.ndimage.map_coordinates(midway[..., k], cell, order=1, mode="nearest") for k in range(3)]
+            expected = steps * np.array(sampled, float)
+        assert np.abs(expected - steps * np.moveaxis(midway, -1, 0)).max() > 0.5
+        np.testing.assert_allclose(np.moveaxis(moved, -1, 0), expected, atol=10 * TOLERANCE_PLACE)
 
 
 def predictions_twin(field, keep):
