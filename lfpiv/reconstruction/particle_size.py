@@ -65,7 +65,7 @@ LIT_SHARE = 0.1
 """Least light of a lens that counts, as a share of the brightest lens's light of an evenly lit volume."""
 LEAST_RANGE = 0.1
 """Least difference of the ratio between the smallest and the largest width. Below it the lenses are too coarse."""
-UNLIKE = 1.1
+UNLIKE = 1.25
 """Least scatter of the brightness, <a><a^3> / <a^2>^2, of particles that are called unlike bright."""
 SIGNIFICANCE = 5.0
 """Least ratio of the covariance to its standard error over the sub-apertures. Below it noise hides the particles."""

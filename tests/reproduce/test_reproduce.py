@@ -197,7 +197,7 @@ def test_network_and_ray_tracing_reconstruct_alike(figures):
         assert ours["q"] == pytest.approx(traced["q"], abs=0.03)  # true geometry: what is left are calibration errors
         assert ours["particles_true"] == round(256 * ppm)
     assert (
-        runs["from_truth", "network", 0.5]["q"] > 0.9 > runs["blobs", "network", 0.5]["q"]
+        runs["from_truth", "network", 0.5]["q"] > max(0.95, runs["blobs", "network", 0.5]["q"])
     )  # the truth is a fixed point
     assert runs["blobs", "network", 0.1]["q"] > 0.7  # sparse: hardly a ghost
     for run in case["runs"]:  # the correlation smooths by what the sieve has not
