@@ -119,14 +119,20 @@ class DotFit:
 
 
 def fit_dots(
-    model: LensIntegral, pixels: BoardPixels, expected: Sequence[ExpectedDot], margin_mm: float
+    model: LensIntegral,
+    pixels: BoardPixels,
+    expected: Sequence[ExpectedDot],
+    margin_mm: float,
+    before: Sequence[DotFit | None] | None = None,
 ) -> list[DotFit | None]:
     """Fit dots, sorted by plane, each to the pixels that its light may reach. None where a dot lights too few pixels.
 
-    The pixels reach `margin_mm` beyond the expected light.
+    The pixels reach `margin_mm` beyond the expected light. `before` are fits of the same dots with other shared
+    parameters; a fit starts from the one before it if that converged. Default: from the expected rays.
     """
+    starts = iter(before if before is not None else [None] * len(expected))
     return [
-        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, margin_mm))
+        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, margin_mm), next(starts))
         for plane, dots in itertools.groupby(expected, lambda dot: dot.plane)
         for signal in [pixels.signals.of_plane(plane)]
         for dot in dots
@@ -284,14 +290,15 @@ class _Step:
     converged: bool
 
 
-def _fit_dot(problem: _Problem) -> DotFit | None:
+def _fit_dot(problem: _Problem, before: DotFit | None) -> DotFit | None:
     """Fit one dot; None where its light would not reach enough pixels, or the fit leaves them."""
     if len(problem.signal) < FEWEST_PIXELS:
         return None
     radius, pixel_mm = problem.model.optics.pupil_radius_mm, problem.model.optics.pupil_pixel_mm
     oldest = _TABLE_AGE * problem.model.cell_reach_mm.min()
-    slope, table = slope_of(problem.dot.theta, radius), problem.table(problem.dot.theta)
-    step = _Step(problem.state(problem.dot.theta, table, None), 1e-3, False)
+    first = before.coefficients if before is not None and before.converged else problem.dot.theta
+    slope, table = slope_of(first, radius), problem.table(first)
+    step = _Step(problem.state(first, table, None), 1e-3, False)
     for _ in range(_ITERATIONS):
         state = step.state
         if not problem.lights_enough(state):

@@ -54,9 +54,11 @@ def estimate_shared(
     prior = np.array([*_SIZE_PRIOR, *[_BEND_PRIOR_PITCHES] * (2 * BENDS)])
     unit = np.array([1, 1, *[pitch] * (2 * BENDS)])
     at = np.zeros(len(prior))  # log(diameter / stated), blur^2 [pixel^2], bend [pitch]
+    found: Sequence[DotFit | None] | None = None
     for _ in range(_ROUNDS):
         model = LensIntegral(optics, lattice, _shared(at, stated_diameter_mm, pitch))
-        fits, typical = _typical(fit_dots(model, pixels, sample, margin_mm))
+        found = fit_dots(model, pixels, sample, margin_mm, found)
+        fits, typical = _typical(found)
         if not fits:
             break
         total = sum(one.pull_information for one in fits) * np.outer(unit, unit) / typical + np.diag(1 / prior**2)
