@@ -70,6 +70,12 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
     runtime.run_chunks(len(calls) * parts, run, chunks=len(calls) * parts, warp_device=device)
 
 
+def parts_of(size: int, fewest: int) -> int:
+    """Return the parts of a launch on the CPU, each with at least `fewest` threads; one if it runs on one core."""
+    cores = runtime.device().threads
+    return 1 if cores == 1 else min(runtime.CHUNKS, 2 * cores, 1 + size // fewest)
+
+
 def load(kernel: wp.Kernel, device: str) -> None:
     """Load the module of a kernel on a device. Log that kernels are compiled if the module is not in the cache."""
     module = kernel.module

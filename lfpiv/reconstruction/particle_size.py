@@ -45,7 +45,7 @@ SPARSITY = 128
 LEAST_LIT = 64
 """Least number of lit voxels in these volumes."""
 KNOWN_VOXELS = 1 << 17
-"""Least number of voxels in all volumes of one known size. A small volume is lit again and again, at other places."""
+"""Least number of voxels in all volumes of one known size. Small volumes are lit several times, at other places."""
 MOST_DRAWS = 4
 """Largest number of volumes of one known size."""
 SUB_APERTURES = 5

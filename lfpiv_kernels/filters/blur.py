@@ -12,8 +12,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.filters import blur_gpu
 from lfpiv_kernels.filters.blur_layout import Axis
-from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.voxels import parts_of
+from lfpiv_kernels.launch import Call, launch, parts_of
 from lfpiv_kernels.transfer import Given, as_given, empty, to_device
 
 wp.set_module_options(native.options("blur.h", contract="fast"))
@@ -21,7 +20,7 @@ wp.set_module_options(native.options("blur.h", contract="fast"))
 BORDERS = ("constant", "nearest")
 """Beyond the volume: zero, or its outermost voxels continued."""
 REACH = 4.0
-"""Reach of the Gaussian that smooths volumes, as of SciPy's [standard deviation]."""
+"""Reach of the Gaussian that smooths volumes [standard deviation]: SciPy's."""
 FEWEST_VOXELS = 8192
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 

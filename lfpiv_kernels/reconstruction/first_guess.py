@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.launch import Call, launch, parts_of
 from lfpiv_kernels.reconstruction import sums
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
-from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, sweep
 from lfpiv_kernels.transfer import empty, to_device, to_host
 
 wp.set_module_options(native.quiet_options())

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.launch import Call, launch, parts_of
 from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
@@ -252,7 +252,7 @@ class SeparableProjector(RayProjector):
         for part in self._parts(self._ray_rows(ray_set)):
             lenses = part.rows * part.strips * weights.lenses
             turn = Call(_turn, lenses, [arrays, rays, part], [self._turned])
-            launch(turn, parts=voxels.parts_of(lenses, FEWEST_LENSES))
+            launch(turn, parts=parts_of(lenses, FEWEST_LENSES))
             inputs, outputs = [arrays, self._turned, part], [self._lines, out]
             gather = Call(_gather, weights.shape[1], inputs, outputs, scratch=True)
             launch(gather, parts=self._launch_parts(part.rows))

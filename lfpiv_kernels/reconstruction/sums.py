@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch
-from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of
+from lfpiv_kernels.launch import Call, launch, parts_of
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS
 from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
 
 wp.set_module_options(native.options("voxels.h"))

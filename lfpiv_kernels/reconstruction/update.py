@@ -6,12 +6,12 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.launch import Call, launch, parts_of
 from lfpiv_kernels.reconstruction import pixel_rays_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, PixelRays
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
-from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, parts_of, sweep_runs
+from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, sweep_runs
 from lfpiv_kernels.transfer import Values, empty, to_device, zeros
 
 wp.set_module_options(native.options("update.h"))

@@ -6,7 +6,7 @@ Volumes have shape (voxel,), float32. A sweep may overwrite one of its arguments
 import warp as wp
 
 from lfpiv_kernels import native, runtime
-from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.launch import Call, launch, parts_of
 from lfpiv_kernels.transfer import empty
 
 wp.set_module_options(native.options("voxels.h"))
@@ -214,9 +214,3 @@ def sweep_runs(kernel: wp.Kernel, inputs: list[object], outputs: list[wp.array |
 def sweep(kernel: wp.Kernel, size: int, inputs: list[object], outputs: list[wp.array | None]) -> None:
     """Launch a kernel on all voxels. An array that is None has no elements there."""
     launch(Call(kernel, size, inputs, outputs), parts=parts_of(size, FEWEST_VOXELS))
-
-
-def parts_of(size: int, fewest: int) -> int:
-    """Return the parts of a launch on the CPU, each with at least `fewest` threads; one if it runs on one core."""
-    cores = runtime.device().threads
-    return 1 if cores == 1 else min(runtime.CHUNKS, 2 * cores, 1 + size // fewest)
