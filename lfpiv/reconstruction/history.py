@@ -29,6 +29,11 @@ class History:
         self.squares.append(misfit.squares)
         self.divergence.append(misfit.divergence)
 
+    def scale(self, squares: float, light: float) -> None:
+        """Divide all misfits by the part of the images that their rays see: that of the squares and of the light."""
+        self.squares = [one / squares for one in self.squares]
+        self.divergence = [one / light for one in self.divergence]
+
     @property
     def epochs(self) -> int:
         """Number of iterations over subsets."""

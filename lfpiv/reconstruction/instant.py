@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import POINT_PASSES, WHOLE_PASSES, Partition, iterate_epochs
+from lfpiv.reconstruction.ordered_subsets import POINT_PASSES, WHOLE_PASSES, Epoch, Partition, Subset, iterate_epochs
 from lfpiv.reconstruction.recording import Recording
 from lfpiv.reconstruction.resting_voxels import DARK, RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
@@ -57,17 +57,10 @@ class PreparedInstant:
         `whole_passes` is the number of passes over all rays after those over subsets; default: `WHOLE_PASSES`, or
         `POINT_PASSES` after subsets of all cameras without a sieve, at most half of all passes. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
-        misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN. Voxels rest only
-        where the first guess is that of the images. Another one shows where particles are: without a sieve, voxels that
-        become dark are left out.
+        misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN.
         """
         settings, normalisation = self.settings, self.normalisation
-        guess = duplicate(self._from_images) if first is None else self._given(first)
-        if settings.active_share > 0:
-            active = part_bright(duplicate(guess), largest(guess), settings.active_share)
-            multiply(guess, active, guess)
-        momentum = Momentum(guess) if settings.accelerate else None
-        state = State(guess, momentum, normalisation.steps)
+        state = self._start(duplicate(self._from_images) if first is None else self._given(first))
         count = settings.iterations if iterations is None else iterations
         history = History(settings, count)
         if whole_passes is None:
@@ -79,7 +72,14 @@ class PreparedInstant:
         rose = False
         with self.equations.locked():
             if partitions:
-                state, rose = self._solve_subsets(state, partitions, history, epochs, brief, first is None, progress)
+                if not brief:  # exact, as all steps begin here
+                    history.append(self.equations.compare(normalisation.sieve(state.coefficients)))
+                resting = RestingVoxels(self.equations)
+                made = iterate_epochs(
+                    self.equations, state, normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
+                )
+                state, rose = _followed(made, state, history, progress)
+                resting.wake()
             left = count - history.epochs
             enough = normalisation.is_joint and history.epochs < possible and not rose
             if enough:
@@ -89,9 +89,69 @@ class PreparedInstant:
                 history.append(Misfit(math.nan, math.nan))
             else:
                 volume, stop = self._solve_whole(state, history, left, progress)
+        last = SmartStop.ENOUGH if enough else SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
+        return self._reconstruction(volume, history, stop or last)
+
+    def refine(
+        self,
+        first: np.ndarray,
+        partitions: Sequence[Partition],
+        *,
+        epochs: int,
+        time: float = 1.0,
+        brief: bool = False,
+        progress: Callable[[float], None] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the instant from a first guess that shows already where particles are, by subsets of the rays.
+
+        No pass over all rays follows. Misfits are those of the subsets before each step, scaled to the light of all
+        rays. After the last step it is that of `Normalisation.sample`, scaled likewise. No voxel rests. Without a sieve
+        voxels that become dark are left out.
+
+        Parameters
+        ----------
+        first : ndarray, shape (z, y, x), float32
+            First guess.
+        partitions : sequence of Partition
+            As of `iterate_epochs`. All have the same rays.
+        epochs : int
+            Largest number of epochs.
+        time : float
+            As of `iterate_epochs`.
+        brief : bool
+            Leave out the misfit after the last step, which is then NaN.
+        progress : callable, optional
+            Called with the finished fraction.
+
+        Raises
+        ------
+        ValueError
+            As `solve`.
+        """
+        state, sieve = self._start(self._given(first)), self.normalisation.sieve
+        history, left_out = History(self.settings, epochs), DARK if sieve.sigma_voxel == 0 else 0.0
+        with self.equations.locked():
+            made = iterate_epochs(
+                self.equations, state, sieve, partitions=partitions, epochs=epochs, left_out=left_out, time=time
+            )
+            state, _ = _followed(made, state, history, progress)
+            history.scale(*self._part_of_light(partitions[0].subsets))
+            volume = sieve(state.coefficients)
+            history.append(Misfit(math.nan, math.nan) if brief else self._sampled(volume))
+        stop = SmartStop.DONE if brief else history.early_stop or SmartStop.DONE
+        return self._reconstruction(volume, history, stop)
+
+    def _start(self, guess: DeviceArray) -> State:
+        """Return the state from which SMART iterates. Overwrites the guess."""
+        if self.settings.active_share > 0:
+            active = part_bright(duplicate(guess), largest(guess), self.settings.active_share)
+            multiply(guess, active, guess)
+        return State(guess, Momentum(guess) if self.settings.accelerate else None, self.normalisation.steps)
+
+    def _reconstruction(self, volume: DeviceArray, history: History, stop: SmartStop) -> Reconstruction:
+        """Return what SMART found, and log a divergence."""
         if stop is SmartStop.DIVERGED:
             log.warning("SMART: %s", stop.value)
-        last = SmartStop.ENOUGH if enough else SmartStop.DONE if settings.tolerance == 0 else SmartStop.ITERATION_LIMIT
         return Reconstruction(
             grid=self.stored.grid,
             volume=self._restored(volume),
@@ -99,31 +159,45 @@ class PreparedInstant:
             views=self.views,
             residual=tuple(float(np.sqrt(squares)) / self._norm for squares in history.squares),
             misfit=tuple(history.divergence),
-            stop=stop or last,
+            stop=stop,
             floor={name: one.floor for name, one in self.recordings.items()},
             camera_gain={name: one.camera_gain for name, one in self.recordings.items()},
             light_outside={name: one.light_outside for name, one in self.recordings.items()},
-            sieve_voxel=normalisation.sieve.sigma_voxel,
+            sieve_voxel=self.normalisation.sieve.sigma_voxel,
             intensity_cap=self.intensity_cap,
-            settings=settings,
+            settings=self.settings,
         )
 
     def sampled_misfit(self, first: np.ndarray | None = None) -> float:
-        """Return the misfit of a first guess (z, y, x) in a part of the rays [counts]; raise ValueError as `solve`.
+        """Return the misfit of a first guess (z, y, x) by a part of the rays [counts]; raise ValueError as `solve`.
 
-        The part is half of each camera's lenses where the rays are divided so, else all. Default: the guess from the
+        It is scaled to the light of all rays. The part is `Normalisation.sample`, or all. Default: the guess from the
         images.
         """
         guess = self._from_images if first is None else self._given(first)
-        volume, sample = self.normalisation.sieve(guess), self.normalisation.sample
         with self.equations.locked():
-            if not sample:
-                return self.equations.compare(volume).divergence
-            self.equations.begin()
-            for subset in sample:
-                for camera, ray_set in subset.parts:
-                    self.equations.compare_part(camera, ray_set, volume)
-            return self.equations.measured().divergence
+            return self._sampled(self.normalisation.sieve(guess)).divergence
+
+    def _sampled(self, volume: DeviceArray) -> Misfit:
+        """Return the misfit of a volume in a part of the rays, scaled to the light of all rays."""
+        sample = self.normalisation.sample
+        if not sample:
+            return self.equations.compare(volume)
+        self.equations.begin()
+        for subset in sample:
+            for camera, ray_set in subset.parts:
+                self.equations.compare_part(camera, ray_set, volume)
+        found, (squares, light) = self.equations.measured(), self._part_of_light(sample)
+        return Misfit(found.squares / squares, found.divergence / light)
+
+    def _part_of_light(self, subsets: Sequence[Subset]) -> tuple[float, float]:
+        """Return the rays' part of the images' sum of squared counts, and of the sum of the counts; 1 without light."""
+        seen = [
+            self.equations.comparisons[camera].counts_of(ray_set) for one in subsets for camera, ray_set in one.parts
+        ]
+        squares = sum(float(np.einsum("i,i", counts, counts, dtype=np.float64)) for counts in seen)
+        light = sum(float(counts.sum(dtype=np.float64)) for counts in seen)
+        return (squares / self._norm**2, light / self._light) if light > 0 else (1.0, 1.0)
 
     def _given(self, first: np.ndarray) -> DeviceArray:
         """Return the caller's first guess, shape (z, y, x), on the device, without light that no camera sees."""
@@ -149,45 +223,10 @@ class PreparedInstant:
         images = (one.image for one in self.recordings.values())
         return float(np.sqrt(sum(np.einsum("i,i", image, image, dtype=np.float64) for image in images)))
 
-    def _solve_subsets(
-        self,
-        state: State,
-        partitions: Sequence[Partition],
-        history: History,
-        epochs: int,
-        brief: bool,
-        rest: bool,
-        progress: Callable[[float], None] | None,
-    ) -> tuple[State, bool]:
-        """Iterate over subsets until few iterations are left or an epoch hardly lowers the misfit.
-
-        Return the state, and whether the misfit of the last epoch rose.
-        """
-        if not brief:  # exact, as all steps begin here
-            history.append(self.equations.compare(self.normalisation.sieve(state.coefficients)))
-        resting = RestingVoxels(self.equations) if rest or not brief else None
-        epochs_of = iterate_epochs(
-            self.equations,
-            state,
-            self.normalisation.sieve,
-            partitions=partitions,
-            epochs=epochs,
-            resting=resting,
-            left_out=DARK if resting is None and self.normalisation.sieve.sigma_voxel == 0 else 0.0,
-        )
-        rose = False
-        for epoch in epochs_of:
-            state, rose = epoch.state, epoch.rose
-            if brief or history.epochs:
-                history.append(epoch.misfit)
-            history.subsets.append(epoch.subsets)
-            if progress is not None:
-                progress(history.epochs / (history.iterations + 1))
-            if history.settled and not epoch.undone:
-                break
-        if resting is not None:
-            resting.wake()
-        return state, rose
+    @cached_property
+    def _light(self) -> float:
+        """Sum of the counts of all images."""
+        return sum(float(one.image.sum(dtype=np.float64)) for one in self.recordings.values())
 
     def _solve_whole(
         self,
@@ -208,3 +247,23 @@ class PreparedInstant:
             if stop is not None:
                 break
         return volume, stop
+
+
+def _followed(
+    epochs: Iterable[Epoch], state: State, history: History, progress: Callable[[float], None] | None
+) -> tuple[State, bool]:
+    """Iterate until an epoch hardly lowers the misfit. Return the state, and whether the misfit of the last one rose.
+
+    The history has the misfit before the first epoch already, or gets the sum over its subsets in place of it.
+    """
+    rose = False
+    for epoch in epochs:
+        state, rose = epoch.state, epoch.rose
+        if len(history.divergence) == history.epochs:
+            history.append(epoch.misfit)
+        history.subsets.append(epoch.subsets)
+        if progress is not None:
+            progress(history.epochs / (history.iterations + 1))
+        if history.settled and not epoch.undone:
+            break
+    return state, rose

@@ -17,6 +17,7 @@ from lfpiv.reconstruction.ordered_subsets import (
     POINT_CONFLICT,
     Partition,
     Subset,
+    joint_subsets,
     step_sizes,
     subsets_of,
 )
@@ -29,6 +30,10 @@ from lfpiv_kernels.transfer import DeviceArray, to_device
 
 COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
+FOLLOWED_STEPS = 8
+"""Steps by subsets of all cameras from the volume of the instant before, without a sieve."""
+CORRECTING, FEWEST_ROWS = 4, 3
+"""One in so many ray rows corrects an instant by those beside it, but at least `FEWEST_ROWS` of them."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 
@@ -134,25 +139,51 @@ class Normalisation:
     def partitions(self) -> tuple[Partition, ...]:
         """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
         if self.is_joint:
-            return (self._joint_partition(),)
+            return (self._joint_partition(self._subsets),)
         cameras = len(self._weights.cameras)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
         in_turn = (self._subsets, subsets_of(cameras)) if may_grow else (self._subsets,)
         last = in_turn[-1]
         return tuple(self._partition(subsets, 0.0 if subsets is last else CONFLICT) for subsets in in_turn)
 
-    def _joint_partition(self) -> Partition:
-        """Return the subsets of all cameras. All have the same step, of another length each."""
-        derived, key = self._weights.derived, ("lengths of joint subsets", len(self._subsets))
+    @cached_property
+    def followed(self) -> tuple[Partition, ...]:
+        """The subsets from which an instant takes steps that starts from the one before.
+
+        Without a sieve the first `FOLLOWED_STEPS` of subsets of all cameras.
+        """
+        if self.is_joint and self.sieve.sigma_voxel == 0:
+            return (self.partitions[0].part(slice(FOLLOWED_STEPS)),)
+        return self.partitions
+
+    @cached_property
+    def correcting(self) -> Partition:
+        """The subset by which an instant takes a step that starts from those beside it.
+
+        One of `CORRECTING` parts of the ray rows of all cameras, not the one in which misfits are sampled, or all rays.
+        """
+        cameras = len(self._weights.cameras)
+        if not self.is_joint:
+            every = Subset(tuple((camera, ALL) for camera in range(cameras)))
+            return Partition((every,), self.steps[:1])
+        rows = min(self._weights.projector(name).ray_sets for name in self._weights.cameras)
+        count = max(min(CORRECTING, rows // FEWEST_ROWS), 1)
+        parts = joint_subsets(cameras, rows, count)
+        chosen = next(number for number, one in enumerate(parts) if one.parts[0][1] == min(1, count - 1))
+        return self._joint_partition(parts).part(slice(chosen, chosen + 1))
+
+    def _joint_partition(self, subsets: tuple[Subset, ...]) -> Partition:
+        """Return subsets of all cameras. All have the same step, of another length each."""
+        derived, key = self._weights.derived, ("lengths of joint subsets", len(subsets))
         if key not in derived:
-            derived[key] = joint_lengths(self._weights, self._subsets)
+            derived[key] = joint_lengths(self._weights, subsets)
         lengths, excess = derived[key]
         size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
-        plain = (SmartStep(size, self.sieve),) * len(self._subsets)
+        plain = (SmartStep(size, self.sieve),) * len(subsets)
         if self.sieve.sigma_voxel == 0:
-            return Partition(self._subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
-        sharpened = (SharpenedStep(size, self.sieve),) * len(self._subsets)
-        return Partition(self._subsets, sharpened, plain, lengths, JOINT_CONFLICT)
+            return Partition(subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
+        sharpened = (SharpenedStep(size, self.sieve),) * len(subsets)
+        return Partition(subsets, sharpened, plain, lengths, JOINT_CONFLICT)
 
     def _partition(self, subsets: tuple[Subset, ...], conflict: float) -> Partition:
         """Return the subsets with the step of each."""

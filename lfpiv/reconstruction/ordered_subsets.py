@@ -20,7 +20,8 @@ enlarge their samples by such a test of norms [3]_. Subsets of all cameras impro
 nearly cancel (`JOINT_CONFLICT`). Without a sieve the volume begins to follow the noise earlier (`POINT_CONFLICT`).
 
 The number of steps decides how near the volume comes to the solution. The share of the rays in each step hardly
-matters. So epochs of many subsets end after `MOST_STEPS` steps.
+matters. So epochs of many subsets end after `MOST_STEPS` steps. Where a first guess shows already where particles are,
+steps by a part of the rays suffice (`Normalisation.followed`, `Normalisation.correcting`).
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
 rises, the epoch is undone, the momentum starts anew, and SMART's own steps follow (here divided by sums that are not
@@ -95,6 +96,11 @@ class Partition:
     """Factor of the exponent in each subset's step; empty for 1."""
     conflict: float = 0.0
     """Agreement of the subsets below which they are left."""
+
+    def part(self, some: slice) -> Partition:
+        """Return the partition's subsets of a slice: a part of the rays."""
+        cut = (self.subsets[some], self.steps[some], self.safer[some], self.lengths[some])
+        return Partition(*cut, self.conflict)
 
     @property
     def most_epochs(self) -> int:
@@ -184,6 +190,7 @@ def iterate_epochs(
     epochs: int,
     resting: RestingVoxels | None = None,
     left_out: float = 0.0,
+    time: float = 1.0,
 ) -> Iterator[Epoch]:
     """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left or the misfit rises.
 
@@ -205,9 +212,11 @@ def iterate_epochs(
         Lets dark voxels rest. Default: all voxels take part in all epochs.
     left_out : float
         Share of the light in the faintest voxels that are left out for good before each epoch but the first one.
+    time : float
+        Nesterov's t_k at which the momentum begins. From 1 on its exponent grows from 0.
     """
     coefficients = duplicate(state.coefficients)
-    momentum = Momentum(duplicate(coefficients), largest=SUBSET_MOMENTUM)
+    momentum = Momentum(duplicate(coefficients), time, SUBSET_MOMENTUM)
     partition, following = partitions[0], list(partitions[1:])
     safely, before = False, math.inf
     for epoch in range(epochs):

@@ -30,7 +30,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.reconstruction.fixed_lag import ITERATIONS as CORRECTIONS
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.instant import PreparedInstant
@@ -58,6 +57,9 @@ DIMMEST = 0.05
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
 
+FOLLOWING_TIME, CORRECTING_TIME = 8.0, 2.0
+"""Nesterov's time at which the momentum begins in an instant that starts from the one before, and in its correction:
+their few steps are longer than plain ones."""
 TRIES = 2
 """Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
@@ -175,9 +177,10 @@ class SequenceSolver:
                 found = prepared.solve(progress=progress)
             else:
                 count = math.ceil(share * self.smart.settings.iterations)
-                if start is Start.PREDICTED:  # as many steps
-                    count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
-                found = prepared.solve(iterations=count, whole_passes=0, first=first, brief=True, progress=progress)
+                if first is None:
+                    found = prepared.solve(iterations=count, whole_passes=0, brief=True, progress=progress)
+                else:
+                    found = self._continued(prepared, first, count, progress)
             return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
 
         if given_up:
@@ -226,8 +229,22 @@ class SequenceSolver:
         if flow is None or not others:
             return alone or own.prepared.solve(progress=progress)
         guess = _concentrated(agreed_guess(own.found, others, flow), own.found)
-        after = own.prepared.solve(iterations=CORRECTIONS, whole_passes=CORRECTIONS, first=guess, progress=progress)
+        partition = own.prepared.normalisation.correcting
+        after = own.prepared.refine(guess, [partition], epochs=1, time=CORRECTING_TIME, progress=progress)
         return own.found.continued_by(after)
+
+    def _continued(
+        self, prepared: PreparedInstant, guess: np.ndarray, count: int, progress: Callable[[float], None] | None
+    ) -> Reconstruction:
+        """Reconstruct an instant from the guess by the one before; in `count` iterations, or as many steps by subsets.
+
+        Its last misfit is NaN.
+        """
+        partitions = prepared.normalisation.followed
+        if not partitions:
+            return prepared.solve(iterations=count, first=guess, brief=True, progress=progress)
+        count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
+        return prepared.refine(guess, partitions, epochs=count, time=FOLLOWING_TIME, brief=True, progress=progress)
 
     def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""

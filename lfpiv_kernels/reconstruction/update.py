@@ -225,7 +225,8 @@ class Comparison:
         self.projector = projector
         self.floor = float(floor)
         pixel = projector.map.pixel
-        self.image = to_device(image[pixel], float)
+        self._counts = image[pixel]
+        self.image = to_device(self._counts, float)
         """Counts of the pixels that voxels light, on the device."""
         self.gain = gain if isinstance(gain, wp.array) else to_device(gain[pixel], float)
         """Their gains."""
@@ -234,6 +235,11 @@ class Comparison:
         self._held = zeros(len(pixel))
         parts = pixel_rays_gpu.WARPS if runtime.device().form == "gpu" else projector.map.rays.runs
         self._sums = [empty(parts, wp.float64) for _ in range(2)]
+
+    def counts_of(self, ray_set: int) -> np.ndarray:
+        """Return the counts of the pixels that see one set of rays only, or of all for ``ALL``, shape (pixel,)."""
+        rays = self.projector.map.of(ray_set)
+        return self._counts[rays.start : rays.end]
 
     def hold(self, volume: wp.array) -> None:
         """Add the projection of `volume` to that of each volume that is compared from now on. Overwrites the rays."""

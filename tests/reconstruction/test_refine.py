@@ -1,0 +1,141 @@
+"""`PreparedInstant.refine`: steps by a part of the rays from a first guess that shows where particles are."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.noisy_blobs import noisy_blobs
+
+from lfpiv.reconstruction import normalisation
+from lfpiv.reconstruction.normalisation import CORRECTING, FEWEST_ROWS, FOLLOWED_STEPS, Normalisation
+from lfpiv.reconstruction.ordered_subsets import Partition, Subset, joint_subsets
+from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.weights import separable
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.transfer import to_device
+
+SIEVES = (0.6, 0.0)
+TOLERANCE_SAMPLE = 0.1  # misfits of some ray rows stand for those of all; rows differ by their noise and their pupil
+TOLERANCE_ROW = 0.3  # of a single row at the edge of the pupil; without scaling it would be a fifteenth
+TOLERANCE_F32 = 2e-5  # a truth in float32 against its own images, after some steps
+FADED = 0.7  # brightness of each other particle in a guess
+GAIN = 0.5  # error of the particles' brightness that is left after the steps: 0.2 to 0.35 here
+
+
+@pytest.fixture(scope="module", params=["voxels", "planes"])
+def recorded(request, device):
+    """Weights of voxels or of planes of voxels, a true volume and its images."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "planes":
+            patch.setattr(separable, "FEWEST_VOXELS", 0)
+        return noisy_blobs(40)
+
+
+def prepared_from(recorded, sieve_voxel, images=None):
+    settings = SmartSettings(iterations=10, sieve_voxel=sieve_voxel, intensity_cap=0.0)
+    return SmartSolver(recorded[0], settings).prepare(recorded[2] if images is None else images)
+
+
+def partitions_of(prepared):
+    """Partitions of both uses: from the instant before, and from those beside it."""
+    return [*prepared.normalisation.followed, prepared.normalisation.correcting]
+
+
+@pytest.mark.parametrize("sieve_voxel", SIEVES)
+def test_misfits_of_some_rays_stand_for_those_of_all(recorded, sieve_voxel):
+    prepared, guess = prepared_from(recorded, sieve_voxel), recorded[1].astype(np.float32)
+    normal, equations = prepared.normalisation, prepared.equations
+
+    def misfit(coefficients):
+        with equations.locked():
+            return equations.compare(to_device(coefficients, float))
+
+    def norm(found):
+        return np.sqrt(found.squares) / prepared._norm
+
+    sieved = normal.sieve(to_device(prepared.stored.store(guess), float))
+    before = misfit(sieved)
+    for partition in partitions_of(prepared):
+        first = partition.part(slice(1))  # the guess is not changed before its misfit is taken
+        found = prepared.refine(guess, [first], epochs=1)
+        after = misfit(prepared.stored.store(found.volume))
+        assert found.misfit[0] == pytest.approx(before.divergence, rel=TOLERANCE_ROW)
+        assert found.residual[0] == pytest.approx(norm(before), rel=TOLERANCE_ROW)
+        assert found.misfit[1] == pytest.approx(after.divergence, rel=TOLERANCE_SAMPLE)
+        assert found.residual[1] == pytest.approx(norm(after), rel=TOLERANCE_SAMPLE)
+
+
+@pytest.mark.parametrize("sieve_voxel", SIEVES)
+def test_the_truth_is_a_fixed_point(recorded, sieve_voxel):
+    weights, truth, _ = recorded
+    prepared = prepared_from(recorded, sieve_voxel)
+    coefficients = np.where(truth > 0.01 * truth.max(), truth, 0).astype(np.float32)
+    sieved = prepared.normalisation.sieve(to_device(prepared.stored.store(coefficients), float))
+    volume = prepared.stored.restore(sieved.numpy())
+    exact = prepared_from(recorded, sieve_voxel, weights(volume))
+    for partition in partitions_of(exact):
+        for time in (1.0, 8.0):
+            found = exact.refine(coefficients, [partition], epochs=1, time=time)
+            assert np.abs(found.volume - volume).max() < TOLERANCE_F32 * volume.max()
+
+
+@pytest.mark.parametrize("sieve_voxel", SIEVES)
+def test_steps_by_some_rays_correct_the_brightness_of_particles(recorded, sieve_voxel):
+    weights, truth, _ = recorded
+    prepared = prepared_from(recorded, sieve_voxel)
+    x = weights.grid.axis_mm(2)
+    wrong = np.where(np.sin(12 * x) > 0, FADED, 2 - FADED).astype(np.float32) * truth.astype(np.float32)
+    light = truth.sum(dtype=np.float64)
+
+    def error(volume):
+        """Of the light of slices of the volume, which noise and the size of particles do not change."""
+        slices = (volume.sum((0, 1), dtype=np.float64), truth.sum((0, 1), dtype=np.float64))
+        return np.abs(slices[0] / volume.sum(dtype=np.float64) - slices[1] / light).sum()
+
+    for partition in prepared.normalisation.followed:
+        found = prepared.refine(wrong, [partition], epochs=1, time=8.0)
+        assert error(found.volume) < GAIN * error(wrong)
+    assert np.isnan(prepared.refine(wrong, [partition], epochs=1, brief=True).misfit[-1])
+
+
+def test_a_momentum_that_begins_later_makes_longer_first_steps(recorded):
+    prepared, guess = prepared_from(recorded, 0.0), recorded[1].astype(np.float32) + np.float32(1e-3)
+    step = [prepared.normalisation.correcting]
+    plain, longer = (prepared.refine(guess, step, epochs=1, time=time).volume for time in (1.0, 2.0))
+    lit = (plain > 0) & (np.abs(np.log(plain / guess, where=plain > 0)) > 1e-3)
+    exponent = 1 / ((1 + np.sqrt(17)) / 2)  # (t - 1) / t' for t = 2
+    ratio = np.log(longer[lit] / guess[lit]) / np.log(plain[lit] / guess[lit])
+    assert np.median(ratio) == pytest.approx(1 + exponent, rel=1e-3)
+
+
+@pytest.mark.parametrize("rows", [3, 5, 7, 9, 15, 30])
+def test_a_correction_takes_rows_that_lie_apart_and_were_not_sampled(monkeypatch, rows):
+    weights = SimpleNamespace(
+        cameras=["a", "b"], has_ray_rows=True, projector=lambda name: SimpleNamespace(ray_sets=rows)
+    )
+    made = object.__new__(Normalisation)
+    made._weights, made._subsets = weights, joint_subsets(2, rows, rows)
+    made.sieve = SimpleNamespace(sigma_voxel=0.0)
+
+    def partition(self, subsets):
+        return Partition(subsets, (None,) * len(subsets), lengths=(1.0,) * len(subsets))
+
+    monkeypatch.setattr(normalisation.Normalisation, "_joint_partition", partition)
+    (subset,) = made.correcting.subsets
+    taken = sorted({row for _, row in subset.parts})
+    assert len(taken) >= min(rows // CORRECTING, FEWEST_ROWS) and {camera for camera, _ in subset.parts} == {0, 1}
+    assert len(set(np.diff(taken))) <= 1
+    sampled = {row for one in made.sample for _, row in one.parts}
+    if len(taken) < rows:
+        assert not sampled & set(taken)
+    followed = made.followed[0].subsets
+    assert followed == made._subsets[:FOLLOWED_STEPS]
+
+
+def test_without_rows_of_pixels_a_correction_takes_all_rays(device):
+    made = object.__new__(Normalisation)
+    made._weights = SimpleNamespace(cameras=["a", "b"], has_ray_rows=False)
+    made._subsets = joint_subsets(2, 2, 2)
+    made.__dict__["steps"] = ("sharpened", "plain")
+    assert made.correcting == Partition((Subset(((0, ALL), (1, ALL))),), ("sharpened",))
