@@ -41,8 +41,8 @@ def light_cut_off(image: np.ndarray) -> float:
 
 def _with_dark_neighbours(image: np.ndarray) -> np.ndarray:
     """Return the counts of the pixels whose neighbours in rows and columns are all dark."""
-    neighbours = image[:-2, 1:-1], image[2:, 1:-1], image[1:-1, :-2], image[1:-1, 2:]
-    counts: np.ndarray = image[1:-1, 1:-1][np.logical_and.reduce([one <= 0 for one in neighbours])]
+    dark = image <= 0
+    counts: np.ndarray = image[1:-1, 1:-1][dark[:-2, 1:-1] & dark[2:, 1:-1] & dark[1:-1, :-2] & dark[1:-1, 2:]]
     return counts
 
 

@@ -19,6 +19,7 @@ from lfpiv.geometry.volume import is_finite
 from lfpiv.reconstruction.dark_noise import dark_noise, light_cut_off
 from lfpiv.reconstruction.intensity_cap import typical_peak
 from lfpiv.weights.operator import Weights
+from lfpiv_kernels import runtime
 
 BRIGHTEST = 99.9
 """Percentile of the counts above the noise to which counts are limited, so that hot pixels have no weight."""
@@ -89,7 +90,7 @@ def record(
         If a floor is missing or out of its range, or an image holds no light where the volume is seen.
     """
     given = _given_floors(floor, weights)
-    lit = {name: _LitPixels(weights, images, name, intensity_cap) for name in weights.cameras}
+    lit = _lit_pixels(weights, images, intensity_cap)
     gains = _camera_gains(weights, lit)
     recordings = {}
     for name, seen in lit.items():
@@ -107,19 +108,20 @@ def record(
 
 
 class _LitPixels:
-    """Counts of one camera's image in the pixels that voxels light, checked, and their figures."""
+    """Counts of one camera's image in the pixels that voxels light and that are not dead, checked, and their figures.
+
+    `pixels` are the numbers of these pixels.
+    """
 
     def __init__(self, weights: Weights, images: Mapping[str, np.ndarray], name: str, intensity_cap: float):
         image = images[name].reshape(-1)
-        alive = np.asarray(weights.cameras[name].gain).reshape(-1) > 0
-        if not (image[alive] > 0).any():
+        dead, self.pixels = _dead_and_lit(weights, name)
+        alive = np.delete(image, dead) if dead.size else image
+        if not alive.max(initial=0) > 0:
             raise ValueError(f"images[{name!r}]: expected some light, got no positive count; check the background.")
-        lit = weights.projector(name).map.pixel
         self.size = image.size
-        self.pixels: np.ndarray = lit[alive[lit]]
-        """Pixels that voxels light and that are not dead."""
         self.counts: np.ndarray = image[self.pixels]
-        if not (self.counts > 0).any():
+        if not self.counts.max(initial=0) > 0:
             raise ValueError(
                 f"images[{name!r}]: expected light where the volume is seen, got none there; check the volume's "
                 "position and the calibration."
@@ -128,7 +130,7 @@ class _LitPixels:
         """Noise of the dark pixels. A floor that the caller gives is no measure of it."""
         self.cut_off = light_cut_off(images[name])
         """Mean count of the pixels of 0 counts before the image was cut off."""
-        whole = float(image[alive].sum(dtype=np.float64))
+        whole = float(alive.sum(dtype=np.float64))
         inside = float(self.counts.sum(dtype=np.float64))
         self.outside = float(np.clip(1 - inside / whole, 0, 1)) if whole > 0 else 0.0
         if intensity_cap > 0:
@@ -140,13 +142,36 @@ class _LitPixels:
         self.without_glare = np.minimum(self.counts, np.float32(min(self.peak, GLARE * median)))
         """The counts, those of reflections limited."""
         positive = np.clip(self.counts, 0, self.peak)
-        self.brightness = float(np.square(positive, dtype=np.float64).sum() / positive.sum(dtype=np.float64))
+        self.brightness = float(np.einsum("i,i", positive, positive, dtype=np.float64) / positive.sum(dtype=np.float64))
         """Mean count weighted by the counts. Dark and hot pixels have no weight."""
 
     def _typical_peak(self, optics: Optics) -> float:
         lit = np.zeros(self.size, np.float32)
         lit[self.pixels] = self.counts
         return typical_peak(lit.reshape(optics.sensor_shape), optics.microimage_pitch_px, self.noise)
+
+
+def _lit_pixels(weights: Weights, images: Mapping[str, np.ndarray], intensity_cap: float) -> dict[str, _LitPixels]:
+    """Return the counts of all cameras, measured side by side."""
+    names = list(weights.cameras)
+    found: dict[str, _LitPixels] = {}
+
+    def measure(_: int, first: int, last: int) -> None:
+        for name in names[first:last]:
+            found[name] = _LitPixels(weights, images, name, intensity_cap)
+
+    runtime.run_chunks(len(names), measure, chunks=len(names), warp_device="cpu")
+    return {name: found[name] for name in names}
+
+
+def _dead_and_lit(weights: Weights, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a camera's dead pixels, and the pixels that voxels light and that are not dead."""
+    derived, key = weights.derived, ("dead and lit pixels", name)
+    if key not in derived:
+        alive, lit = weights.gain(name) > 0, weights.projector(name).map.pixel
+        derived[key] = np.flatnonzero(~alive), lit[alive[lit]]
+    dead, pixels = derived[key]
+    return dead, pixels
 
 
 def _median_and_peak(counts: np.ndarray) -> tuple[float, float]:

@@ -24,6 +24,8 @@ PIECE = 4096
 """Elements that a thread of the CPU sums."""
 DIGIT = 8
 """Thresholds that one sweep of `brightest_share` tries on a GPU: a digit of the result's 32 bits, to the base 8."""
+UNSORTED_BITS = 16
+"""Lower bits of the light by which voxels are not told apart at first on the CPU."""
 LAST = 10
 """The last sweep, after which all bits are known."""
 
@@ -242,14 +244,12 @@ def brightest_share(light: wp.array, share: float) -> wp.array:
 
     It stays on the device, shape (1,), float32. Equal voxels are kept or left out together. `light` is >= 0.
 
-    On the CPU the light is sorted. On a GPU the threshold is the smallest float32 number up to which voxels hold the
-    share, found digit by digit of its bits.
+    The threshold is the smallest float32 number up to which voxels hold the share. On the CPU it is found in two steps:
+    its upper bits from the light of all voxels by theirs, then by sorting those that have them. On a GPU it is found
+    digit by digit of its bits.
     """
     if runtime.device().form == "cpu":
-        ordered = np.sort(to_host(light))
-        below = np.cumsum(ordered, dtype=np.float64)
-        place = min(int(np.searchsorted(below, share * below[-1])), len(ordered) - 1)
-        return to_device(ordered[place : place + 1].copy(), float)
+        return to_device(_threshold(to_host(light), share), float)
     known, whole, least = zeros(1, wp.uint64), zeros(1, wp.float64), empty(1)
     lanes, groups = empty(LANES, Sums), empty(GROUPS, Sums)
     for digit in range(LAST + 1):
@@ -257,6 +257,18 @@ def brightest_share(light: wp.array, share: float) -> wp.array:
         launch(Call(_sum_vectors, GROUPS, [lanes, _piece(LANES, GROUPS)], [groups]))
         launch(Call(_next_digit, 1, [groups, wp.float64(share), digit], [known, whole, least]))
     return least
+
+
+def _threshold(light: np.ndarray, share: float) -> np.ndarray:
+    """Return the threshold of `brightest_share`, shape (1,)."""
+    upper = light.view(np.uint32) >> UNSORTED_BITS  # in the order of the light, which is >= 0
+    below = np.cumsum(np.bincount(upper, light))
+    wanted = share * below[-1]
+    place = min(max(int(np.searchsorted(below, wanted)), int(upper.min())), len(below) - 1)
+    ordered = np.sort(light[upper == place])
+    within = np.cumsum(ordered, dtype=np.float64) + (below[place - 1] if place else 0.0)
+    at = min(int(np.searchsorted(within, wanted)), len(ordered) - 1)
+    return ordered[at : at + 1].copy()
 
 
 def _piece(size: int, threads: int) -> Piece:
