@@ -31,14 +31,16 @@ def unexplained(*volumes: xr.DataArray | np.ndarray) -> float:
     """Return the systematic variance over the square of the median random standard deviation, the largest of volumes.
 
     It is `RANDOM_SHARE` or `POINT_SHARE` times the final residual of the images, ||I - P|| / ||I||. Volumes of
-    `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration; 0 if none states it.
+    `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration, NaN where it was not measured;
+    the last one that was measured counts. 0 if none states it.
     """
     shares = [0.0]
     for volume in volumes:
         if isinstance(volume, xr.DataArray) and "residual" in volume.attrs:
             share = RANDOM_SHARE if volume.attrs.get("sieve_voxel", 0.0) > 0 else POINT_SHARE
-            shares.append(share * float(np.atleast_1d(volume.attrs["residual"])[-1]))
-    return max(shares)
+            residual = np.atleast_1d(volume.attrs["residual"]).astype(float)
+            shares.extend(share * residual[np.isfinite(residual)][-1:])
+    return float(max(shares))
 
 
 def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, share: float) -> np.ndarray:

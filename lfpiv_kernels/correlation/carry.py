@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.correlation.control_grid import at_place
 from lfpiv_kernels.correlation.deform import MARGIN
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.launch import Call, launch
@@ -22,24 +23,6 @@ ROUNDS = 4
 
 @wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
 def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float: ...
-
-
-@wp.func
-def _between(field: wp.array3d(dtype=wp.vec3), z: float, y: float, x: float):
-    """Interpolate the displacement at a place in units of the control grid."""
-    iz = wp.min(int(z), field.shape[0] - 2)
-    iy = wp.min(int(y), field.shape[1] - 2)
-    ix = wp.min(int(x), field.shape[2] - 2)
-    tz = z - float(iz)
-    ty = y - float(iy)
-    tx = x - float(ix)
-    found = wp.vec3()
-    for k in range(2):
-        share = wp.where(k == 0, 1.0 - tx, tx)
-        near = (1.0 - ty) * field[iz, iy, ix + k] + ty * field[iz, iy + 1, ix + k]
-        far = (1.0 - ty) * field[iz + 1, iy, ix + k] + ty * field[iz + 1, iy + 1, ix + k]
-        found += share * ((1.0 - tz) * near + tz * far)
-    return found
 
 
 @wp.kernel
@@ -60,7 +43,7 @@ def _follow(
         fz = wp.clamp(float(z) + 0.5 * moved[0] / spacing[0], 0.0, float(midway.shape[0] - 1))
         fy = wp.clamp(float(y) + 0.5 * moved[1] / spacing[1], 0.0, float(midway.shape[1] - 1))
         fx = wp.clamp(float(x) + 0.5 * moved[2] / spacing[2], 0.0, float(midway.shape[2] - 1))
-        moved = steps * _between(midway, fz, fy, fx)
+        moved = steps * at_place(midway, fz, fy, fx)
     moved_out[z, y, x] = moved
 
 
@@ -91,7 +74,7 @@ def _carry(
             carried_out[z, y, x] = 0.0
             inside_out[z, y, x] = 0.0
             return
-    moved = _between(field, float(z) / spacing[0], float(y) / spacing[1], float(x) / spacing[2])
+    moved = at_place(field, float(z) / spacing[0], float(y) / spacing[1], float(x) / spacing[2])
     pz = float(z) + moved[0]
     py = float(y) + moved[1]
     px = float(x) + moved[2]

@@ -15,6 +15,7 @@ import warp as wp
 
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.correlation import deform_gpu, filters_gpu
+from lfpiv_kernels.correlation.control_grid import at_column, mix
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.filters import spline
 from lfpiv_kernels.launch import Call, launch
@@ -30,14 +31,6 @@ MARGIN = 6
 
 @wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
 def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float: ...
-
-
-@wp.func
-def _between(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
-    """Interpolate the displacement at a control point along x between four along z and y."""
-    near = (1.0 - ty) * field[iz, iy, ix] + ty * field[iz, iy + 1, ix]
-    far = (1.0 - ty) * field[iz + 1, iy, ix] + ty * field[iz + 1, iy + 1, ix]
-    return (1.0 - tz) * near + tz * far
 
 
 @wp.kernel
@@ -71,10 +64,10 @@ def _deform_pair(
         ix = wp.min(int(fx), field.shape[2] - 2)
         tx = fx - float(ix)
         if ix != cell:
-            left = _between(field, iz, iy, ix, tz, ty)
-            right = _between(field, iz, iy, ix + 1, tz, ty)
+            left = at_column(field, iz, iy, ix, tz, ty)
+            right = at_column(field, iz, iy, ix + 1, tz, ty)
             cell = ix
-        half = 0.5 * ((1.0 - tx) * left + tx * right)
+        half = 0.5 * mix(tx, left, right)
         pz = float(z + margin) + offset
         py = float(y + margin) + offset
         px = float(x + margin) + offset

@@ -3,6 +3,7 @@
 import warp as wp
 
 from lfpiv_kernels import native
+from lfpiv_kernels.correlation.control_grid import at_place
 from lfpiv_kernels.launch import Call
 
 wp.set_module_options(native.options("deform.h", contract="fast"))
@@ -10,20 +11,6 @@ wp.set_module_options(native.options("deform.h", contract="fast"))
 
 @wp.func_native("return lfpiv::sample_spline(coefficients.data, shape, z, y, x);")
 def _sample(coefficients: wp.array(dtype=float), shape: wp.vec3i, z: float, y: float, x: float) -> float: ...
-
-
-@wp.func
-def _mix(share: float, one: wp.vec3, other: wp.vec3):
-    """Interpolate linearly between two displacements."""
-    return (1.0 - share) * one + share * other
-
-
-@wp.func
-def _at_column(field: wp.array3d(dtype=wp.vec3), iz: int, iy: int, ix: int, tz: float, ty: float):
-    """Interpolate the displacement at a control point along x between four along z and y."""
-    near = _mix(ty, field[iz, iy, ix], field[iz, iy + 1, ix])
-    far = _mix(ty, field[iz + 1, iy, ix], field[iz + 1, iy + 1, ix])
-    return _mix(tz, near, far)
 
 
 @wp.kernel
@@ -45,15 +32,7 @@ def _deform(
     fz = (float(z) + offset) / spacing[0]
     fy = (float(y) + offset) / spacing[1]
     fx = (float(x) + offset) / spacing[2]
-    iz = wp.min(int(fz), field.shape[0] - 2)
-    iy = wp.min(int(fy), field.shape[1] - 2)
-    ix = wp.min(int(fx), field.shape[2] - 2)
-    tz = fz - float(iz)
-    ty = fy - float(iy)
-    tx = fx - float(ix)
-    left = _at_column(field, iz, iy, ix, tz, ty)
-    right = _at_column(field, iz, iy, ix + 1, tz, ty)
-    moved = share * _mix(tx, left, right)
+    moved = share * at_place(field, fz, fy, fx)
     volume_out[z, y, x] = _sample(
         coefficients,
         shape,

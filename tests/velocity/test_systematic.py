@@ -69,3 +69,9 @@ def test_the_residual_of_particles_smaller_than_voxels_counts_less():
     points, blobs = (volume.assign_attrs(sieve_voxel=sieve) for sieve in (0.0, 0.6))
     assert unexplained(points, points) == unexplained(volume, volume) == POINT_SHARE * 0.4
     assert unexplained(blobs, blobs) > unexplained(points, points) > 0
+
+
+def test_a_residual_that_was_not_measured_counts_as_the_one_before():
+    volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6)
+    assert unexplained(volume.assign_attrs(residual=[0.9, 0.3, np.nan])) == pytest.approx(0.3 * RANDOM_SHARE)
+    assert unexplained(volume.assign_attrs(residual=[np.nan])) == 0
