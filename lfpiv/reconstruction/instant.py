@@ -78,7 +78,7 @@ class PreparedInstant:
                 made = iterate_epochs(
                     self.equations, state, normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
                 )
-                state, rose = _followed(made, state, history, progress)
+                state, rose = _run_epochs(made, state, history, progress)
                 resting.wake()
             left = count - history.epochs
             enough = normalisation.is_joint and history.epochs < possible and not rose
@@ -134,7 +134,7 @@ class PreparedInstant:
             made = iterate_epochs(
                 self.equations, state, sieve, partitions=partitions, epochs=epochs, left_out=left_out, time=time
             )
-            state, _ = _followed(made, state, history, progress)
+            state, _ = _run_epochs(made, state, history, progress)
             history.scale(*self._part_of_light(partitions[0].subsets))
             volume = sieve(state.coefficients)
             history.append(Misfit(math.nan, math.nan) if brief else self._sampled(volume))
@@ -249,7 +249,7 @@ class PreparedInstant:
         return volume, stop
 
 
-def _followed(
+def _run_epochs(
     epochs: Iterable[Epoch], state: State, history: History, progress: Callable[[float], None] | None
 ) -> tuple[State, bool]:
     """Iterate until an epoch hardly lowers the misfit. Return the state, and whether the misfit of the last one rose.

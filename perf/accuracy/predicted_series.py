@@ -78,7 +78,7 @@ PARTS = {
     "check": (PreparedInstant, "sampled_misfit"),
     "guess of the correction": (sequence, "agreed_guess"),
     "first guess": (instant, "multiplicative_guess"),
-    "subsets": (instant, "_followed"),
+    "subsets": (instant, "_run_epochs"),
     "whole passes": (PreparedInstant, "_solve_whole"),
     "all": (Reconstructor, "instant"),
     "followed": (Reconstructor, "follow"),
