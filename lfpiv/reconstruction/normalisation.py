@@ -17,7 +17,7 @@ from lfpiv.reconstruction.ordered_subsets import (
     POINT_CONFLICT,
     Partition,
     Subset,
-    joint_subsets,
+    correcting_subset,
     step_sizes,
     subsets_of,
 )
@@ -32,8 +32,6 @@ COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 FOLLOWED_STEPS = 8
 """Steps by subsets of all cameras from the volume of the instant before, without a sieve."""
-CORRECTING, FEWEST_ROWS = 4, 3
-"""One in so many ray rows corrects an instant by those beside it, but at least `FEWEST_ROWS` of them."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 
@@ -160,16 +158,14 @@ class Normalisation:
     def correcting(self) -> Partition:
         """The subset by which an instant takes a step that starts from those beside it.
 
-        One of `CORRECTING` parts of the ray rows of all cameras, not the one in which misfits are sampled, or all rays.
+        Some ray rows of all cameras, see `correcting_subset`, or all rays.
         """
         cameras = len(self._weights.cameras)
         if not self.is_joint:
             every = Subset(tuple((camera, ALL) for camera in range(cameras)))
             return Partition((every,), self.steps[:1])
         rows = min(self._weights.projector(name).ray_sets for name in self._weights.cameras)
-        count = max(min(CORRECTING, rows // FEWEST_ROWS), 1)
-        parts = joint_subsets(cameras, rows, count)
-        chosen = next(number for number, one in enumerate(parts) if one.parts[0][1] == min(1, count - 1))
+        parts, chosen = correcting_subset(cameras, rows)
         return self._joint_partition(parts).part(slice(chosen, chosen + 1))
 
     def _joint_partition(self, subsets: tuple[Subset, ...]) -> Partition:

@@ -70,6 +70,8 @@ CONFLICT = 0.5
 exponents."""
 JOINT_CONFLICT, POINT_CONFLICT = 0.1, 0.5
 """Agreement of subsets of all cameras below which the passes over all rays follow, with a sieve and without."""
+CORRECTING, FEWEST_ROWS = 4, 3
+"""One in so many ray rows corrects an instant by those beside it, but at least `FEWEST_ROWS` of them."""
 MOST_STEPS = 128
 """Steps by subsets after which no other epoch of subsets of all cameras begins."""
 
@@ -169,6 +171,17 @@ def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
         for first in order
         if first < count
     )
+
+
+def correcting_subset(cameras: int, sets: int) -> tuple[tuple[Subset, ...], int]:
+    """Divide the ray rows of all cameras, one of every `CORRECTING`; return all parts and the number of one.
+
+    Each part has `FEWEST_ROWS` rows at least. The one returned has none of those by which guesses are compared, unless
+    it is all of them.
+    """
+    count = max(min(CORRECTING, sets // FEWEST_ROWS), 1)
+    parts = joint_subsets(cameras, sets, count)
+    return parts, next(number for number, one in enumerate(parts) if one.parts[0][1] == min(1, count - 1))
 
 
 def step_sizes(column_sum: np.ndarray, subset_sums: Sequence[np.ndarray], lit: np.ndarray) -> list[np.ndarray]:

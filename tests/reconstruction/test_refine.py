@@ -1,14 +1,11 @@
 """`PreparedInstant.refine`: steps by a part of the rays from a first guess that shows where particles are."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from support.noisy_blobs import noisy_blobs
 
-from lfpiv.reconstruction import normalisation
-from lfpiv.reconstruction.normalisation import CORRECTING, FEWEST_ROWS, FOLLOWED_STEPS, Normalisation
-from lfpiv.reconstruction.ordered_subsets import Partition, Subset, joint_subsets
+from lfpiv.reconstruction.normalisation import COMPARED, FOLLOWED_STEPS
+from lfpiv.reconstruction.ordered_subsets import CORRECTING, FEWEST_ROWS, Subset, correcting_subset, joint_subsets
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights import separable
@@ -52,7 +49,8 @@ def test_misfits_of_some_rays_stand_for_those_of_all(recorded, sieve_voxel):
             return equations.compare(to_device(coefficients, float))
 
     def norm(found):
-        return np.sqrt(found.squares) / prepared._norm
+        images = (one.image.astype(float) for one in prepared.recordings.values())
+        return np.sqrt(found.squares / sum((image**2).sum() for image in images))
 
     sieved = normal.sieve(to_device(prepared.stored.store(guess), float))
     before = misfit(sieved)
@@ -109,33 +107,26 @@ def test_a_momentum_that_begins_later_makes_longer_first_steps(recorded):
     assert np.median(ratio) == pytest.approx(1 + exponent, rel=1e-3)
 
 
-@pytest.mark.parametrize("rows", [3, 5, 7, 9, 15, 30])
-def test_a_correction_takes_rows_that_lie_apart_and_were_not_sampled(monkeypatch, rows):
-    weights = SimpleNamespace(
-        cameras=["a", "b"], has_ray_rows=True, projector=lambda name: SimpleNamespace(ray_sets=rows)
-    )
-    made = object.__new__(Normalisation)
-    made._weights, made._subsets = weights, joint_subsets(2, rows, rows)
-    made.sieve = SimpleNamespace(sigma_voxel=0.0)
-
-    def partition(self, subsets):
-        return Partition(subsets, (None,) * len(subsets), lengths=(1.0,) * len(subsets))
-
-    monkeypatch.setattr(normalisation.Normalisation, "_joint_partition", partition)
-    (subset,) = made.correcting.subsets
-    taken = sorted({row for _, row in subset.parts})
-    assert len(taken) >= min(rows // CORRECTING, FEWEST_ROWS) and {camera for camera, _ in subset.parts} == {0, 1}
-    assert len(set(np.diff(taken))) <= 1
-    sampled = {row for one in made.sample for _, row in one.parts}
-    if len(taken) < rows:
-        assert not sampled & set(taken)
-    followed = made.followed[0].subsets
-    assert followed == made._subsets[:FOLLOWED_STEPS]
+@pytest.mark.parametrize("rows", [1, 2, 3, 5, 7, 9, 11, 12, 15, 30])
+def test_a_correction_takes_rows_that_lie_apart_and_were_not_sampled(rows):
+    parts, chosen = correcting_subset(2, rows)
+    taken = sorted({row for _, row in parts[chosen].parts})
+    assert len(parts[chosen].parts) == 2 * len(taken) and {camera for camera, _ in parts[chosen].parts} == {0, 1}
+    assert len(taken) >= min(rows, FEWEST_ROWS) and len(set(np.diff(taken))) <= 1
+    assert len(parts) == CORRECTING or len(taken) < 2 * FEWEST_ROWS
+    sampled = {row for one in joint_subsets(2, rows, rows)[: -(-rows // COMPARED)] for _, row in one.parts}
+    assert len(taken) == rows or not sampled & set(taken)
 
 
-def test_without_rows_of_pixels_a_correction_takes_all_rays(device):
-    made = object.__new__(Normalisation)
-    made._weights = SimpleNamespace(cameras=["a", "b"], has_ray_rows=False)
-    made._subsets = joint_subsets(2, 2, 2)
-    made.__dict__["steps"] = ("sharpened", "plain")
-    assert made.correcting == Partition((Subset(((0, ALL), (1, ALL))),), ("sharpened",))
+@pytest.mark.parametrize("sieve_voxel", SIEVES)
+def test_rows_of_pixels_where_there_are_some(recorded, sieve_voxel):
+    normal = prepared_from(recorded, sieve_voxel).normalisation
+    (correcting,) = normal.correcting.subsets
+    if not recorded[0].has_ray_rows:
+        assert correcting == Subset(((0, ALL), (1, ALL))) and normal.followed == normal.partitions
+        return
+    rows = min(recorded[0].projector(name).ray_sets for name in recorded[0].cameras)
+    parts, chosen = correcting_subset(2, rows)
+    assert correcting == parts[chosen] and len(correcting.parts) < 2 * rows
+    (whole,), (followed,) = normal.partitions, normal.followed
+    assert followed.subsets == whole.subsets[: FOLLOWED_STEPS if sieve_voxel == 0 else None]
