@@ -34,7 +34,7 @@ from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
-from lfpiv.runs.particles import track
+from lfpiv.runs.particles import FrameFits, track
 from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
@@ -101,6 +101,8 @@ class PairWork:
             self.images.start(())
         if instants is not None:
             instants.clear()
+            if self.experiment.tracking is not None and self.weights is not None:
+                self.fits.last = None
 
     def instants(self, stored: Collection[int] = ()) -> Instants | None:
         """Return the instants of a series, of which none is known yet; None for image pairs."""
@@ -360,7 +362,7 @@ class PairWork:
 
     def _track(self, files: PairFiles, volumes: PairVolumes, vectors: xr.Dataset) -> list[Warning]:
         """Find and link the particles of both frames and write them; return the warnings about them."""
-        table, found = track(self.search, [self.light_again(file.frame) for file in files.frames], volumes, vectors)
+        table, found = track(self.fits, [self.light_again(file.frame) for file in files.frames], volumes, vectors)
         self.write(partial(files.write_particles, table))
         name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
         log.info(
@@ -377,10 +379,11 @@ class PairWork:
         return found
 
     @cached_property
-    def search(self) -> ParticleSearch:
-        """Search for particles of this rig, made once for all pairs."""
+    def fits(self) -> FrameFits:
+        """Particles of the latest frame, and the search for particles of this rig, made once for all pairs."""
         assert self.weights is not None and self.experiment.tracking is not None
-        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
+        search = ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
+        return FrameFits(search, self.experiment.series is not None)
 
 
 def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:

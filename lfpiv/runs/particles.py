@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 
+from lfpiv.experiment.experiment import Frame
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.tracking.finding import ParticleSearch
+from lfpiv.tracking.fit import Fit
 from lfpiv.tracking.linking import link_particles
 from lfpiv.tracking.pairing import exchange
 from lfpiv.warn import Code, Warning
@@ -23,15 +27,40 @@ LEAST_FOUND = 20
 """Least number of particles in a frame that this share is judged by."""
 
 
+@dataclass
+class FrameFits:
+    """Particles that are fitted to each frame by itself.
+
+    In a series the second frame of a pair is the first one of another pair. So its particles are kept until then.
+    """
+
+    search: ParticleSearch
+    """Search for particles of the rig."""
+    in_series: bool
+    last: tuple[Frame, Fit] | None = None
+    """The latest second frame, and its particles before those of the first frame told them where to look."""
+
+    def of(self, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
+        """Return the particles of both frames of a pair, which the caller may change."""
+        known, fits = self.last, list[Fit]()
+        for frame, volume in zip(light, volumes.volumes, strict=True):
+            if known is not None and known[0] == frame.frame:
+                fits.append(known[1])
+            else:
+                fits.append(self.search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None))
+        self.last = (light[1].frame, copy.copy(fits[1])) if self.in_series else None
+        return fits
+
+
 def track(
-    search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes, vectors: xr.Dataset
+    fits: FrameFits, light: Sequence[FrameLight], volumes: PairVolumes, vectors: xr.Dataset
 ) -> tuple[xr.Dataset, list[Warning]]:
     """Find and link the particles of a pair.
 
     Parameters
     ----------
-    search : ParticleSearch
-        Search for particles of the rig.
+    fits : FrameFits
+        Particles of the pair before, and the search for others.
     light : sequence of FrameLight
         Images of both frames.
     volumes : PairVolumes
@@ -46,13 +75,9 @@ def track(
     warnings : list of Warning
         Doubts whether particles can be told apart.
     """
-    fits = [
-        search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None)
-        for frame, volume in zip(light, volumes.volumes, strict=True)
-    ]
-    first, second = exchange(search, fits, vectors)
+    first, second = exchange(fits.search, fits.of(light, volumes), vectors)
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
-    return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
+    return table, [*crowded_warnings(table, len(fits.search.weights.cameras)), *unlinked_warnings(table)]
 
 
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
