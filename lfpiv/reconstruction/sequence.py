@@ -59,7 +59,8 @@ FAINTEST = 1e-6
 
 FOLLOWING_TIME, CORRECTING_TIME = 8.0, 2.0
 """Nesterov's time at which the momentum begins in an instant that starts from the one before, and in its correction:
-their few steps are longer than plain ones."""
+their few steps are longer than plain ones. Without a sieve longer steps by whole cameras or halves of their lenses
+follow the noise, so there it begins at 1."""
 TRIES = 2
 """Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
@@ -240,11 +241,12 @@ class SequenceSolver:
 
         Its last misfit is NaN.
         """
-        partitions = prepared.normalisation.followed
-        if not partitions:
+        normal = prepared.normalisation
+        if not normal.followed:
             return prepared.solve(iterations=count, first=guess, brief=True, progress=progress)
         count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
-        return prepared.refine(guess, partitions, epochs=count, time=FOLLOWING_TIME, brief=True, progress=progress)
+        time = FOLLOWING_TIME if normal.is_joint or normal.sieve.sigma_voxel > 0 else 1.0
+        return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
 
     def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""
