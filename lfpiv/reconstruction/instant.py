@@ -169,7 +169,7 @@ class PreparedInstant:
         )
 
     def sampled_misfit(self, first: np.ndarray | None = None) -> float:
-        """Return the misfit of a first guess (z, y, x) by a part of the rays [counts]; raise ValueError as `solve`.
+        """Return the misfit of a first guess (z, y, x) in a part of the rays [counts]; raise ValueError as `solve`.
 
         It is scaled to the light of all rays. The part is `Normalisation.sample`, or all. Default: the guess from the
         images.

@@ -31,7 +31,7 @@ from lfpiv_kernels.transfer import DeviceArray, to_device
 COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 FOLLOWED_STEPS = 8
-"""Steps by subsets of all cameras from the volume of the instant before, without a sieve."""
+"""Number of steps by subsets of all cameras from the volume of the instant before, without a sieve."""
 LEAST_COLUMN_SUM = 1e-6
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
 
@@ -146,7 +146,7 @@ class Normalisation:
 
     @cached_property
     def followed(self) -> tuple[Partition, ...]:
-        """The subsets from which an instant takes steps that starts from the one before.
+        """The subsets by which an instant is reconstructed from the volume of the one before.
 
         Without a sieve the first `FOLLOWED_STEPS` of subsets of all cameras.
         """
@@ -156,9 +156,9 @@ class Normalisation:
 
     @cached_property
     def correcting(self) -> Partition:
-        """The subset by which an instant takes a step that starts from those beside it.
+        """The subset by which an instant is corrected after its comparison with those beside it.
 
-        Some ray rows of all cameras, see `correcting_subset`, or all rays.
+        It has some ray rows of all cameras, see `correcting_subset`, or all rays where rows are not told apart.
         """
         cameras = len(self._weights.cameras)
         if not self.is_joint:

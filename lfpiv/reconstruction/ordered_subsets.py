@@ -71,7 +71,7 @@ exponents."""
 JOINT_CONFLICT, POINT_CONFLICT = 0.1, 0.5
 """Agreement of subsets of all cameras below which the passes over all rays follow, with a sieve and without."""
 CORRECTING, FEWEST_ROWS = 4, 3
-"""One in so many ray rows corrects an instant by those beside it, but at least `FEWEST_ROWS` of them."""
+"""Number of parts of the ray rows, one of which corrects an instant, and the least number of rows of a part."""
 MOST_STEPS = 128
 """Steps by subsets after which no other epoch of subsets of all cameras begins."""
 
@@ -174,10 +174,10 @@ def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
 
 
 def correcting_subset(cameras: int, sets: int) -> tuple[tuple[Subset, ...], int]:
-    """Divide the ray rows of all cameras, one of every `CORRECTING`; return all parts and the number of one.
+    """Divide the ray rows of all cameras into parts; return them and the number of the one that corrects an instant.
 
-    Each part has `FEWEST_ROWS` rows at least. The one returned has none of those by which guesses are compared, unless
-    it is all of them.
+    There are `CORRECTING` parts, or fewer where parts would have less than `FEWEST_ROWS` rows. The chosen one has no
+    row by which guesses are compared, unless it has all rows.
     """
     count = max(min(CORRECTING, sets // FEWEST_ROWS), 1)
     parts = joint_subsets(cameras, sets, count)

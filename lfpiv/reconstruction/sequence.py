@@ -59,8 +59,8 @@ FAINTEST = 1e-6
 
 FOLLOWING_TIME, CORRECTING_TIME = 8.0, 2.0
 """Nesterov's time at which the momentum begins in an instant that starts from the one before, and in its correction:
-their few steps are longer than plain ones. Without a sieve longer steps by whole cameras or halves of their lenses
-follow the noise, so there it begins at 1."""
+their few steps are longer than plain ones. From the instant before it begins at 1 where there is no sieve and subsets
+are whole cameras or halves of their lenses: longer steps by these follow the noise."""
 TRIES = 2
 """Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
@@ -237,7 +237,7 @@ class SequenceSolver:
     def _continued(
         self, prepared: PreparedInstant, guess: np.ndarray, count: int, progress: Callable[[float], None] | None
     ) -> Reconstruction:
-        """Reconstruct an instant from the guess by the one before; in `count` iterations, or as many steps by subsets.
+        """Reconstruct an instant from a guess by the one before, in `count` iterations or by as many steps of subsets.
 
         Its last misfit is NaN.
         """

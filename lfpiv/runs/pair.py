@@ -101,8 +101,7 @@ class PairWork:
             self.images.start(())
         if instants is not None:
             instants.clear()
-            if self.experiment.tracking is not None and self.weights is not None:
-                self.fits.last = None
+            self.fits.last = None
 
     def instants(self, stored: Collection[int] = ()) -> Instants | None:
         """Return the instants of a series, of which none is known yet; None for image pairs."""
@@ -362,7 +361,8 @@ class PairWork:
 
     def _track(self, files: PairFiles, volumes: PairVolumes, vectors: xr.Dataset) -> list[Warning]:
         """Find and link the particles of both frames and write them; return the warnings about them."""
-        table, found = track(self.fits, [self.light_again(file.frame) for file in files.frames], volumes, vectors)
+        light = [self.light_again(file.frame) for file in files.frames]
+        table, found = track(self.search, self.fits, light, volumes, vectors)
         self.write(partial(files.write_particles, table))
         name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
         log.info(
@@ -380,10 +380,14 @@ class PairWork:
 
     @cached_property
     def fits(self) -> FrameFits:
-        """Particles of the latest frame, and the search for particles of this rig, made once for all pairs."""
+        """Particles of the latest frame."""
+        return FrameFits(self.experiment.series is not None)
+
+    @cached_property
+    def search(self) -> ParticleSearch:
+        """Search for particles of this rig, made once for all pairs."""
         assert self.weights is not None and self.experiment.tracking is not None
-        search = ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
-        return FrameFits(search, self.experiment.series is not None)
+        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
 
 
 def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:

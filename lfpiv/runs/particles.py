@@ -34,33 +34,33 @@ class FrameFits:
     In a series the second frame of a pair is the first one of another pair. So its particles are kept until then.
     """
 
-    search: ParticleSearch
-    """Search for particles of the rig."""
     in_series: bool
     last: tuple[Frame, Fit] | None = None
     """The latest second frame, and its particles before those of the first frame told them where to look."""
 
-    def of(self, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
+    def of(self, search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
         """Return the particles of both frames of a pair, which the caller may change."""
         known, fits = self.last, list[Fit]()
         for frame, volume in zip(light, volumes.volumes, strict=True):
             if known is not None and known[0] == frame.frame:
                 fits.append(known[1])
             else:
-                fits.append(self.search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None))
+                fits.append(search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None))
         self.last = (light[1].frame, copy.copy(fits[1])) if self.in_series else None
         return fits
 
 
 def track(
-    fits: FrameFits, light: Sequence[FrameLight], volumes: PairVolumes, vectors: xr.Dataset
+    search: ParticleSearch, fits: FrameFits, light: Sequence[FrameLight], volumes: PairVolumes, vectors: xr.Dataset
 ) -> tuple[xr.Dataset, list[Warning]]:
     """Find and link the particles of a pair.
 
     Parameters
     ----------
+    search : ParticleSearch
+        Search for particles of the rig.
     fits : FrameFits
-        Particles of the pair before, and the search for others.
+        Particles of the pair before.
     light : sequence of FrameLight
         Images of both frames.
     volumes : PairVolumes
@@ -75,9 +75,9 @@ def track(
     warnings : list of Warning
         Doubts whether particles can be told apart.
     """
-    first, second = exchange(fits.search, fits.of(light, volumes), vectors)
+    first, second = exchange(search, fits.of(search, light, volumes), vectors)
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
-    return table, [*crowded_warnings(table, len(fits.search.weights.cameras)), *unlinked_warnings(table)]
+    return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
 
 
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:

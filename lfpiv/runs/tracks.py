@@ -106,7 +106,7 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
     """
     experiment, series = work.experiment, work.experiment.series
     assert series is not None
-    search = replace(work.fits.search, sigma_voxel=_size(work, pairs))
+    search = replace(work.search, sigma_voxel=_size(work, pairs))
     cameras = len(search.weights.cameras)
     instants = _instants(experiment, pairs)
 
