@@ -1,5 +1,6 @@
 """Launches of Warp kernels: each cut into parts that run side by side on the CPU's threads, whole on CUDA."""
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from lfpiv_kernels import caches, runtime
 
 _loaded: set[tuple[str, str]] = set()
 """Modules and devices that `load` has met in this process."""
+_loading = threading.RLock()  # Warp compiles in one thread at a time
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,10 @@ def parts_of(size: int, fewest: int) -> int:
 def load(kernel: wp.Kernel, device: str) -> None:
     """Load the module of a kernel on a device. Log that kernels are compiled if the module is not in the cache."""
     module = kernel.module
-    if (module.name, device) not in _loaded:
-        _loaded.add((module.name, device))
-        folder = Path(wp.config.kernel_cache_dir)
-        if not (folder / module.get_module_identifier(1 if device == "cpu" else None)).is_dir():
-            caches.log_compilation(folder)
-    wp.load_module(module, device=device)
+    with _loading:
+        if (module.name, device) not in _loaded:
+            _loaded.add((module.name, device))
+            folder = Path(wp.config.kernel_cache_dir)
+            if not (folder / module.get_module_identifier(1 if device == "cpu" else None)).is_dir():
+                caches.log_compilation(folder)
+        wp.load_module(module, device=device)

@@ -15,12 +15,14 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lfpiv_kernels import caches
 
 log = logging.getLogger(__name__)
 
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 TAICHI = os.environ.get("LFPIV_TAICHI", "")
 """Where Taichi's kernels run if not on the device: "vulkan", by any driver. For tests: Warp has no such device."""
@@ -274,3 +276,18 @@ def run_chunks(
         wait(begun)
     for helper in begun:
         helper.result()
+
+
+def side_by_side(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Call two functions that use nothing in common, on two threads on the CPU, in turn on CUDA.
+
+    Each may launch kernels on all threads. An exception of one of them is raised here, after both have ended.
+    """
+    found: list[Any] = [None, None]
+
+    def call(_: int, begin: int, end: int) -> None:
+        for number in range(begin, end):
+            found[number] = (first, second)[number]()
+
+    run_chunks(2, call, chunks=2)
+    return found[0], found[1]

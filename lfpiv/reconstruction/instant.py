@@ -187,8 +187,13 @@ class PreparedInstant:
         for subset in sample:
             for camera, ray_set in subset.parts:
                 self.equations.compare_part(camera, ray_set, volume)
-        found, (squares, light) = self.equations.measured(), self._part_of_light(sample)
+        found, (squares, light) = self.equations.measured(), self._sampled_part
         return Misfit(found.squares / squares, found.divergence / light)
+
+    @cached_property
+    def _sampled_part(self) -> tuple[float, float]:
+        """`_part_of_light` of `Normalisation.sample`."""
+        return self._part_of_light(self.normalisation.sample)
 
     def _part_of_light(self, subsets: Sequence[Subset]) -> tuple[float, float]:
         """Return the rays' part of the images' sum of squared counts, and of the sum of the counts; 1 without light."""

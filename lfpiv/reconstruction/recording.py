@@ -95,10 +95,8 @@ def record(
     recordings = {}
     for name, seen in lit.items():
         noise, least = (seen.noise, LEAST_FLOOR) if given is None else (given[name], LEAST_GIVEN)
-        image = np.zeros(seen.size, np.float32)
-        image[seen.pixels] = np.maximum(seen.counts, 0)
         recordings[name] = Recording(
-            image=image,
+            image=seen.image,
             floor=max(noise, least * seen.peak, floor_share * seen.brightness),
             peak=seen.peak,
             camera_gain=gains[name],
@@ -144,6 +142,9 @@ class _LitPixels:
         positive = np.clip(self.counts, 0, self.peak)
         self.brightness = float(np.einsum("i,i", positive, positive, dtype=np.float64) / positive.sum(dtype=np.float64))
         """Mean count weighted by the counts. Dark and hot pixels have no weight."""
+        self.image = np.zeros(image.size, np.float32)
+        """The counts, at least 0, and 0 in all other pixels, shape (pixel,)."""
+        self.image[self.pixels] = np.maximum(self.counts, 0)
 
     def _typical_peak(self, optics: Optics) -> float:
         lit = np.zeros(self.size, np.float32)

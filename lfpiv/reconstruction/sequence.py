@@ -40,6 +40,7 @@ from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.settings.processing import Correlation
+from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import deform
 
 PERSISTENCE = 0.9
@@ -169,9 +170,11 @@ class SequenceSolver:
         ValueError
             If `SmartSolver.solve` or `correlate` refuse their arguments.
         """
-        prepared = self.smart.prepare(images, floor=floor)
         given_up = before is not None and before.given_up
-        flow, vectors = (None, None) if before is None or given_up else self._flow(before)
+        known = None if given_up else before
+        prepared, (flow, vectors) = runtime.side_by_side(
+            lambda: self.smart.prepare(images, floor=floor), lambda: self._flow(known)
+        )
 
         def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
             if share == 1:
@@ -248,8 +251,10 @@ class SequenceSolver:
         time = FOLLOWING_TIME if normal.is_joint or normal.sieve.sigma_voxel > 0 else 1.0
         return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
 
-    def _flow(self, before: Before) -> tuple[xr.Dataset | None, xr.Dataset | None]:
+    def _flow(self, before: Before | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""
+        if before is None:
+            return None, None
         if before.earlier is None:
             return before.flow, None
         found = self._measure(before.earlier, before.measured, self.correlation, before.flow)

@@ -18,6 +18,8 @@ from lfpiv_kernels.transfer import empty, to_device, to_host
 
 wp.set_module_options(native.quiet_options())
 
+FEWEST_PIXELS = 8192
+"""Pixels of a part of the logarithms on the CPU."""
 SMALL = 1e-3
 """Below this log(1 + x) and exp(x) - 1 are series, since 1 + x loses digits of x."""
 
@@ -108,8 +110,12 @@ def add_logarithms(comparison: Comparison, floor: float, out: wp.array) -> None:
     image = empty(comparison.size)
     pixel = comparison.projector.map.rays.pixel
     if runtime.device().form == "cpu":
-        counts, gain = to_host(comparison.image), to_host(comparison.gain)
-        to_host(image)[to_host(pixel)] = gain * np.log1p(counts / floor)
+        counts, gain, place, out_of = (to_host(one) for one in (comparison.image, comparison.gain, pixel, image))
+
+        def fill(_: int, first: int, last: int) -> None:
+            out_of[place[first:last]] = gain[first:last] * np.log1p(counts[first:last] / floor)
+
+        runtime.run_chunks(pixel.size, fill, chunks=parts_of(pixel.size, FEWEST_PIXELS))
     else:
         inputs = [pixel, comparison.image, comparison.gain, float(floor)]
         launch(Call(_logarithm, pixel.size, inputs, [image]))

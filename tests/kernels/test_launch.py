@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.launch import Call, launch
+from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.transfer import to_device
 
 TIMEOUT_S = 60.0
@@ -131,3 +131,36 @@ def test_a_thread_that_is_late_keeps_no_array(device, monkeypatch):
     free.set()
     blocker.join()
     assert whole and not kept
+
+
+def test_two_functions_run_side_by_side_on_the_cpu(device, monkeypatch):
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cpu", form="cpu", threads=2))
+    both = threading.Barrier(2)  # broken where one waits for the other to end
+    first, second = runtime.side_by_side(lambda: both.wait(TIMEOUT_S), lambda: both.wait(TIMEOUT_S))
+    assert {first, second} == {0, 1}
+
+
+def test_two_functions_run_in_turn_on_a_gpu(device, monkeypatch):
+    monkeypatch.setattr(runtime, "device", lambda: replace(device, kind="cuda", form="gpu"))
+    order = []
+    runtime.side_by_side(lambda: order.append("first"), lambda: order.append("second"))
+    assert order == ["first", "second"]
+
+
+def test_modules_are_loaded_by_one_thread_at_a_time(monkeypatch):
+    """Warp's compilation is not thread-safe."""
+    inside, most = [], []
+
+    def record(module, device):
+        inside.append(module)
+        time.sleep(0.05)
+        most.append(len(inside))
+        inside.pop()
+
+    monkeypatch.setattr(wp, "load_module", record)
+    threads = [threading.Thread(target=load, args=(_count_visits, "cpu")) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1, 1, 1]
