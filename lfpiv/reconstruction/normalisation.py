@@ -32,8 +32,9 @@ COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 FOLLOWED_STEPS = 8
 """Number of steps by subsets of all cameras from the volume of the instant before, without a sieve."""
-LEAST_COLUMN_SUM = 1e-6
-"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one."""
+LEAST_COLUMN_SUM = 0.02
+"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one. Below it, as where a voxel
+lights little more than dead pixels, errors of the weights themselves decide the sum, and a step divided by it."""
 
 
 class Normalisation:

@@ -7,8 +7,9 @@ far apart the cameras show the same particles; `correct` fits the movements of t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +19,13 @@ from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import frame_light, read_darks
-from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, unlinked, without_still_light
+from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, still_light, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
 from lfpiv.warn import Code, Warning, name_pairs, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
-    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.experiment.experiment import Experiment, Frame
     from lfpiv.selfcalibration.movements import Movement, MovementFit
     from lfpiv.weights.operator import Weights
 
@@ -129,13 +130,9 @@ def correct(
 
     It stays the board's where the images do not show how cameras moved; the figures say why.
     """
-    darks, used, images = read_darks(experiment), list[int](), list[dict[str, np.ndarray]]()
-    for pair in experiment.self_calibration_pairs:
-        try:
-            images += _moving_light(experiment, calibration.cameras, darks, pair)
-        except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
-            log.debug("self-calibration without pair %d: %s", pair, error)
-            continue
+    shown, used, images = _ShownParticles(experiment, calibration.cameras), list[int](), list[dict[str, np.ndarray]]()
+    for pair, moving in shown.without_still_light(experiment.self_calibration_pairs):
+        images += moving
         used.append(pair)
     try:
         found = self_calibrate(calibration, experiment.grid, images, progress=progress)
@@ -164,12 +161,12 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
     """
     if len(weights.cameras) < 2:
         return None
-    darks, volumes, used = read_darks(experiment), CameraVolumes(weights), list[int]()
+    shown, volumes, used = _ShownParticles(experiment, weights.cameras), CameraVolumes(weights), list[int]()
     fit, lost, losses, clear = None, list[str](), 0, True
     limit_mm = LARGE_VOXEL * experiment.grid.voxel_mm
-    for pair in islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED):
+    tried = list(islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED))
+    for pair, light in shown.without_still_light(tried):
         try:
-            light = _moving_light(experiment, weights.cameras, darks, pair)
             for images in light:
                 volumes.add(images)
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
@@ -207,22 +204,42 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
     return sum(fit.share_in(one) > LIKE for one in fits) >= AGREEING
 
 
-def _moving_light(
-    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], darks: Mapping[str, np.ndarray | None], pair: int
-) -> list[dict[str, np.ndarray]]:
-    """Return the images of both frames of a pair, camera name -> image, without the light that stays in place.
+@dataclass(frozen=True)
+class _ShownParticles:
+    """Particle images of pairs, camera name -> image, those of the pairs that show particles."""
 
-    Raises
-    ------
-    InputError
-        If an image is missing or damaged.
-    ValueError
-        If an image shows no particles.
-    """
-    light = [frame_light(experiment, cameras, darks, frame) for frame in experiment.pair_frames(pair)]
-    if min(value for one in light for value in one.structure.values()) < NOISE:
-        raise ValueError("expected particles, found only noise")
-    return without_still_light([one.images for one in light])
+    experiment: Experiment
+    cameras: Mapping[str, CalibratedCamera]
+
+    @cached_property
+    def _darks(self) -> Mapping[str, np.ndarray | None]:
+        return read_darks(self.experiment)
+
+    def without_still_light(self, pairs: Sequence[int]) -> Iterator[tuple[int, list[dict[str, np.ndarray]]]]:
+        """Yield each pair with the images of both its frames without the light that stays in place in all pairs.
+
+        In a slow flow particles hardly move between the frames of one pair, so this light is that of all pairs. Their
+        images are read twice: together they may not fit into memory.
+        """
+        still = still_light(images for _, frames in self._each(pairs) for images in frames)
+        for pair, frames in self._each(pairs):
+            yield pair, [without_still_light(images, still) for images in frames]
+
+    def _each(self, pairs: Iterable[int]) -> Iterator[tuple[int, list[Mapping[str, np.ndarray]]]]:
+        for pair in pairs:
+            try:
+                light = [self._light(frame) for frame in self.experiment.pair_frames(pair)]
+            except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
+                log.debug("movements of the cameras without pair %d: %s", pair, error)
+                continue
+            yield pair, light
+
+    def _light(self, frame: Frame) -> Mapping[str, np.ndarray]:
+        """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
+        found = frame_light(self.experiment, self.cameras, self._darks, frame)
+        if min(found.structure.values()) < NOISE:
+            raise ValueError("expected particles, found only noise")
+        return found.images
 
 
 def _shows_particles(images: Mapping[str, np.ndarray], cameras: Mapping[str, CalibratedCamera]) -> bool:

@@ -96,23 +96,33 @@ class Disparity:
         return float(np.sqrt(shift_mm @ self.weight @ shift_mm))
 
 
-def without_still_light(instants: Sequence[Mapping[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-    """Subtract from images the light that all instants have at the same pixels: reflections, hot pixels, stray light.
+def still_light(instants: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the light that all instants have at the same pixels: reflections, hot pixels, stray light.
 
-    Particles that hardly move between the instants are subtracted, too.
+    Particles that hardly move between the instants count, too. So instants of several pairs tell it better than two.
 
     Parameters
     ----------
-    instants : sequence of dict
-        Particle images, camera name -> image (rows, columns) [counts], background removed. Two instants or more.
+    instants : iterable of dict
+        Particle images, camera name -> image (rows, columns) [counts], background removed. Two instants or more. One
+        after the other is held.
 
     Returns
     -------
-    list of dict
-        The images less `STILL` times the lowest positive count of each pixel.
+    dict
+        Camera name -> the lowest positive count of each pixel, shape (rows, columns), else 0; empty without instants.
     """
-    still = {name: np.maximum(np.min([one[name] for one in instants], axis=0), 0) for name in instants[0]}
-    return [{name: image - np.float32(STILL) * still[name] for name, image in one.items()} for one in instants]
+    still: dict[str, np.ndarray] = {}
+    for images in instants:
+        for name, image in images.items():
+            lowest = np.maximum(image, 0)
+            still[name] = np.minimum(still[name], lowest) if name in still else lowest
+    return still
+
+
+def without_still_light(images: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the images of an instant less `STILL` times the light of `still_light`."""
+    return {name: image - np.float32(STILL) * still[name] for name, image in images.items()}
 
 
 class CameraVolumes:

@@ -284,8 +284,21 @@ def test_light_that_stays_in_place_is_left_out():
     moving = np.zeros((2, 20, 30), np.float32)
     moving[0, 5, 6] = moving[1, 8, 9] = 300
     instants = [{"left": still * energy + own} for energy, own in zip((1.0, 0.9), moving, strict=True)]
-    first, second = (one["left"] for one in disparity.without_still_light(instants))
+    kept = disparity.still_light(instants)
+    first, second = (disparity.without_still_light(one, kept)["left"] for one in instants)
     assert (first > 0).sum() == (second > 0).sum() == 1 and first[5, 6] > 0 and second[8, 9] > 0
+
+
+def test_particles_that_hardly_move_between_the_frames_of_a_pair_are_no_still_light(small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    for folder in (file.parent / "particles").iterdir():
+        images = sorted(folder.iterdir())
+        for first, second in zip(images[::2], images[1::2], strict=True):
+            shutil.copyfile(first, second)
+    experiment = lfpiv.open_experiment(file)
+    weights = lfpiv.build_weights(lfpiv.load_calibration(small_run.out / "calibration.h5"), experiment.grid)
+    found = moved_cameras.check(experiment, weights, [0])
+    assert found is not None and found.voxel < AGREE_VOXEL
 
 
 def test_cameras_that_did_not_move_stay(small_run, tmp_path):
