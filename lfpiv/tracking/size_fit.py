@@ -19,6 +19,8 @@ CLEAR_OVERLAP = 0.3
 """Overlap of a particle's image with another one above which it does not tell the size."""
 LEAST_CLEAR, MOST_CLEAR = 8, 100
 """Least and largest number of particles that tell the size."""
+WEAK = 0.5
+"""Light of a particle, relative to one that it overlaps, below which it may be what a wrong size leaves of that one."""
 LARGEST_RATIO = 1.15
 """Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
 Particles that are not told apart look larger."""
@@ -40,9 +42,13 @@ def fit_size(fit: Fit) -> None:
 def _better_size(fit: Fit) -> ParticleImages:
     """Return the model with the size that explains the images of clear particles best, from three sizes."""
     assert fit.normal is not None
-    cloud = fit.cloud[_clear(fit.normal, fit.cloud.light)]
+    clear, others = _clear(fit.normal, fit.cloud.light)
+    cloud, rest = fit.cloud[clear], fit.cloud[others]
     own = rendered(fit.model, fit.model.lists(cloud.positions_mm), cloud.light)
-    scene = replace(fit.scene, counts=fit.scene.counts - (fit.normal.model - own))
+    counts = fit.scene.counts
+    if len(rest):
+        counts = counts - rendered(fit.model, fit.model.lists(rest.positions_mm), rest.light)
+    scene = replace(fit.scene, counts=counts)
     variance, lit = fit.scene.variance(fit.normal.model), own > 0
     chi2 = []
     for power in (-1, 0, 1):
@@ -56,14 +62,41 @@ def _better_size(fit: Fit) -> ParticleImages:
     return fit.model.of_size(min(fit.model.sigma_voxel * SIZE_STEP**change, fit.largest_voxel))
 
 
-def _clear(normal: Normal, light: np.ndarray) -> np.ndarray:
-    """Return particles of typical light whose images hardly overlap others; of all particles if few do not."""
+def _clear(normal: Normal, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Choose particles of typical light whose images hardly overlap others, of all particles if few do not.
+
+    Where few do not, weak particles that overlap brighter ones are left out first. Too small a size leaves light of
+    each particle, which weak ones beside it explain.
+
+    Returns
+    -------
+    clear : ndarray of int
+        Numbers of the particles that tell the size.
+    others : ndarray of int
+        Numbers of the particles beside them. Those in neither are left out.
+    """
     first, second, overlap = overlaps(normal)
-    mixed = np.zeros(len(light), bool)
     close = (overlap > CLEAR_OVERLAP).any(1)
-    mixed[first[close]], mixed[second[close]] = True, True
-    clear = np.flatnonzero(~mixed) if (~mixed).sum() >= LEAST_CLEAR else np.arange(len(light))
-    mean = np.maximum(light[clear].mean(1), 1e-9)
-    unlike = np.abs(np.log(mean / max(candidates.typical(mean), 1e-9)))
-    usual: np.ndarray = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
-    return usual
+    first, second, mean = first[close], second[close], np.maximum(light.mean(1), 1e-9)
+    every = np.ones(len(light), bool)
+    kept, alone = every, _alone(every, first, second)
+    if alone.sum() < LEAST_CLEAR:
+        kept = every.copy()
+        kept[first[mean[first] < WEAK * mean[second]]] = False
+        kept[second[mean[second] < WEAK * mean[first]]] = False
+        alone = _alone(kept, first, second)
+    if alone.sum() < LEAST_CLEAR:
+        kept = alone = every
+    clear = np.flatnonzero(alone)
+    unlike = np.abs(np.log(mean[clear] / max(candidates.typical(mean[clear]), 1e-9)))
+    usual = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
+    others = kept.copy()
+    others[usual] = False
+    return usual, np.flatnonzero(others)
+
+
+def _alone(kept: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return which kept particles are in no pair of kept ones, shape (particle,), bool."""
+    alone, both = kept.copy(), kept[first] & kept[second]
+    alone[first[both]] = alone[second[both]] = False
+    return alone
