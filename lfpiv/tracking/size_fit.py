@@ -21,6 +21,8 @@ LEAST_CLEAR, MOST_CLEAR = 8, 100
 """Least and largest number of particles that tell the size."""
 WEAK = 0.5
 """Light of a particle, relative to one that it overlaps, below which it may be what a wrong size leaves of that one."""
+MOSTLY = 0.5
+"""Least share of the particles that must be clear once weak ones are left out: in dense seeding they are true ones."""
 LARGEST_RATIO = 1.15
 """Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
 Particles that are not told apart look larger."""
@@ -42,13 +44,11 @@ def fit_size(fit: Fit) -> None:
 def _better_size(fit: Fit) -> ParticleImages:
     """Return the model with the size that explains the images of clear particles best, from three sizes."""
     assert fit.normal is not None
-    clear, others = _clear(fit.normal, fit.cloud.light)
-    cloud, rest = fit.cloud[clear], fit.cloud[others]
+    clear, weak = _clear(fit.normal, fit.cloud.light)
+    cloud, explained = fit.cloud[clear], fit.cloud[np.concatenate([clear, weak])]
     own = rendered(fit.model, fit.model.lists(cloud.positions_mm), cloud.light)
-    counts = fit.scene.counts
-    if len(rest):
-        counts = counts - rendered(fit.model, fit.model.lists(rest.positions_mm), rest.light)
-    scene = replace(fit.scene, counts=counts)
+    theirs = rendered(fit.model, fit.model.lists(explained.positions_mm), explained.light) if len(weak) else own
+    scene = replace(fit.scene, counts=fit.scene.counts - (fit.normal.model - theirs))
     variance, lit = fit.scene.variance(fit.normal.model), own > 0
     chi2 = []
     for power in (-1, 0, 1):
@@ -72,8 +72,8 @@ def _clear(normal: Normal, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     -------
     clear : ndarray of int
         Numbers of the particles that tell the size.
-    others : ndarray of int
-        Numbers of the particles beside them. Those in neither are left out.
+    weak : ndarray of int
+        Numbers of the particles that are left out.
     """
     first, second, overlap = overlaps(normal)
     close = (overlap > CLEAR_OVERLAP).any(1)
@@ -85,14 +85,12 @@ def _clear(normal: Normal, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         kept[first[mean[first] < WEAK * mean[second]]] = False
         kept[second[mean[second] < WEAK * mean[first]]] = False
         alone = _alone(kept, first, second)
-    if alone.sum() < LEAST_CLEAR:
-        kept = alone = every
+        if alone.sum() < max(LEAST_CLEAR, MOSTLY * kept.sum()):
+            kept = alone = every
     clear = np.flatnonzero(alone)
     unlike = np.abs(np.log(mean[clear] / max(candidates.typical(mean[clear]), 1e-9)))
     usual = clear[np.argsort(unlike, kind="stable")[:MOST_CLEAR]]
-    others = kept.copy()
-    others[usual] = False
-    return usual, np.flatnonzero(others)
+    return usual, np.flatnonzero(~kept)
 
 
 def _alone(kept: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
