@@ -33,8 +33,8 @@ COMPARED = 8
 FOLLOWED_STEPS = 8
 """Number of steps by subsets of all cameras from the volume of the instant before, without a sieve."""
 LEAST_COLUMN_SUM = 0.02
-"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one. Below it, as where a voxel
-lights little more than dead pixels, errors of the weights themselves decide the sum, and a step divided by it."""
+"""Least sum of the weights of a voxel that some camera sees, as a share of the largest one. Smaller sums are those of
+voxels whose pixels are nearly all dead. Errors of the weights decide these sums, and steps divide by them."""
 
 
 class Normalisation:

@@ -206,7 +206,7 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
 
 @dataclass(frozen=True)
 class _ShownParticles:
-    """Particle images of pairs, camera name -> image, those of the pairs that show particles."""
+    """Particle images of the pairs that show particles. An image of each camera is given by its name."""
 
     experiment: Experiment
     cameras: Mapping[str, CalibratedCamera]
@@ -216,10 +216,10 @@ class _ShownParticles:
         return read_darks(self.experiment)
 
     def without_still_light(self, pairs: Sequence[int]) -> Iterator[tuple[int, list[dict[str, np.ndarray]]]]:
-        """Yield each pair with the images of both its frames without the light that stays in place in all pairs.
+        """Yield each pair and the images of both its frames, without the light that stays in place in all pairs.
 
-        In a slow flow particles hardly move between the frames of one pair, so this light is that of all pairs. Their
-        images are read twice: together they may not fit into memory.
+        One pair does not tell that light in a slow flow, where particles hardly move between its frames. Images are
+        read twice, since those of all pairs may not fit into memory.
         """
         still = still_light(images for _, frames in self._each(pairs) for images in frames)
         for pair, frames in self._each(pairs):

@@ -22,7 +22,7 @@ LEAST_CLEAR, MOST_CLEAR = 8, 100
 WEAK = 0.5
 """Light of a particle, relative to one that it overlaps, below which it may be what a wrong size leaves of that one."""
 MOSTLY = 0.5
-"""Least share of the particles that must be clear once weak ones are left out: in dense seeding they are true ones."""
+"""Least share of the particles that are clear once weak ones are left out. In dense seeding weak ones are true ones."""
 LARGEST_RATIO = 1.15
 """Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
 Particles that are not told apart look larger."""
@@ -65,8 +65,8 @@ def _better_size(fit: Fit) -> ParticleImages:
 def _clear(normal: Normal, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Choose particles of typical light whose images hardly overlap others, of all particles if few do not.
 
-    Where few do not, weak particles that overlap brighter ones are left out first. Too small a size leaves light of
-    each particle, which weak ones beside it explain.
+    Where few are clear, weak particles that overlap brighter ones are left out first. A size that is too small leaves
+    light of each particle. Weak ones beside it explain that light.
 
     Returns
     -------

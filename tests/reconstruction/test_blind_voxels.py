@@ -7,7 +7,7 @@ from support.ideal_rig import IdealCamera, IdealRig, rotation
 import lfpiv
 
 BRIGHTER = 1.5
-"""Light of the brightest voxel over that without dead pixels. Of the particles one or two lose some of their light."""
+"""Most light of the brightest voxel, relative to that without dead pixels."""
 
 
 @pytest.mark.parametrize("lit", [0.02, 0.01])
