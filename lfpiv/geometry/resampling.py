@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ EDGE = 1e-6
 """Tolerance of places at the faces of a grid [voxel]."""
 SMOOTH_VOXEL = 0.5
 """Least standard deviation of Gaussians of which a volume is made that samples of it represent well [voxel]."""
+
+MATRICES = 6
+"""Number of matrices that are kept: those of the axes of two grids."""
 
 
 def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
@@ -117,6 +121,7 @@ def _resampled(values: np.ndarray, sampling: list[np.ndarray], ratio: float, dar
     return np.ascontiguousarray(positive * np.float32(scale))
 
 
+@lru_cache(MATRICES)
 def _sampling(given: Grid, grid: Grid, axis: int) -> np.ndarray:
     """Return the matrix that samples the spline of one grid at the voxels of another along an axis, float32.
 
@@ -133,6 +138,7 @@ def _sampling(given: Grid, grid: Grid, axis: int) -> np.ndarray:
     return _of_values(matrix)
 
 
+@lru_cache(MATRICES)
 def _integral(given: Grid, grid: Grid, axis: int) -> np.ndarray:
     """Return the matrix that averages the spline of one grid over the voxels of another along an axis, float32."""
     count, place, edge = given.shape[axis], _place(given, grid, axis), grid.voxel_mm / given.voxel_mm
@@ -158,7 +164,9 @@ def _of_values(matrix: np.ndarray) -> np.ndarray:
     count = matrix.shape[1]
     if count > 1:
         matrix = matrix @ ndimage.spline_filter1d(np.eye(count), order=3, axis=0, mode="mirror")
-    return matrix.astype(np.float32)
+    values: np.ndarray = matrix.astype(np.float32)
+    values.flags.writeable = False  # callers share it
+    return values
 
 
 def _place(given: Grid, grid: Grid, axis: int) -> np.ndarray:

@@ -28,8 +28,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
-from scipy import ndimage, special
+from scipy import special
 
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.lightfield.microimage_layout import microimage_centres
@@ -54,6 +55,8 @@ PUPIL_SHARE = 0.6
 """Largest coordinate of a sub-aperture along an axis of the pupil, as a share of the pupil's radius."""
 MEAN_LENSES = 3.0
 """Standard deviation of the Gaussian over which the mean light is taken [lens]."""
+MEAN_REACH = 4
+"""Distance at which that Gaussian ends [standard deviation]."""
 FAR_LENSES = (4, 5, 6)
 """Distances at which products show no particles any more, only light that varies slowly [lens]."""
 PROTRUDING_VOXEL = 0.93
@@ -171,8 +174,10 @@ class SubApertures:
 
 def _local_mean(light: np.ndarray) -> np.ndarray:
     """Return the mean of nearby lenses, shape (sub-aperture, j, i)."""
-    blurred: np.ndarray = ndimage.gaussian_filter(light, (0, MEAN_LENSES, MEAN_LENSES), mode="constant")
-    return blurred
+    kernel, mean = cv2.getGaussianKernel(2 * round(MEAN_REACH * MEAN_LENSES) + 1, MEAN_LENSES), np.empty_like(light)
+    for one, blurred in zip(light, mean, strict=True):
+        cv2.sepFilter2D(one, -1, kernel, kernel, dst=blurred, borderType=cv2.BORDER_CONSTANT)
+    return mean
 
 
 def _evenly_lit(weights: Weights) -> np.ndarray:

@@ -8,6 +8,7 @@ not move as the particles do fade.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
@@ -27,6 +28,9 @@ LARGEST_GAIN = 3.0
 """Largest factor by which the other frame brightens a voxel."""
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
+
+MATRICES = 6
+"""Number of matrices of `_linear` that are kept: those of the axes of two fields."""
 
 
 def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list[np.ndarray]:
@@ -94,7 +98,7 @@ class MotionField:
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)
         for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
-            trust = _linear(trust, nodes, np.arange(count), axis)
+            trust = np.moveaxis(np.tensordot(_linear(tuple(nodes), count), trust, (1, axis)), 0, axis)
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, shape (z, y, x)."""
 
@@ -111,7 +115,9 @@ class MotionField:
         return carry(coefficients, field, self.midway.spacing, wanted)
 
 
-def _linear(values: np.ndarray, nodes: np.ndarray, points: np.ndarray, axis: int) -> np.ndarray:
-    """Interpolate linearly between values at nodes along an axis, constant beyond the outer nodes."""
-    matrix = np.stack([np.interp(points, nodes, unit) for unit in np.eye(len(nodes))], axis=1)
-    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+@lru_cache(MATRICES)
+def _linear(nodes: tuple[float, ...], count: int) -> np.ndarray:
+    """Return the matrix from values at nodes to values at voxels: linear, constant beyond the outer nodes."""
+    matrix = np.stack([np.interp(np.arange(count), nodes, unit) for unit in np.eye(len(nodes))], axis=1)
+    matrix.flags.writeable = False  # callers share it
+    return matrix

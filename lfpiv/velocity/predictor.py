@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
@@ -20,6 +21,8 @@ from lfpiv_kernels.transfer import Values, to_host
 
 CONTROL_SPACING = 4
 """Largest distance of control points [voxel]."""
+MATRICES = 12
+"""Number of matrices between nodes and points that are kept: those of the axes of the passes of a pair."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,7 @@ class Predictor:
         """Interpolate a field of shape (z, y, x, 3) [voxel], known at `nodes` along each axis of a volume."""
         counts = [max(2, math.ceil((n - 1) / CONTROL_SPACING) + 1) for n in shape]
         points = tuple(np.linspace(0, max(n - 1, 1), count) for n, count in zip(shape, counts, strict=True))
-        matrices = [spline_matrix(*axis) for axis in zip(nodes, points, strict=True)]
+        matrices = [spline_matrix(tuple(at), tuple(to)) for at, to in zip(nodes, points, strict=True)]
         return cls(points=points, control=to_control_points(matrices, field), shape=shape)
 
     @property
@@ -63,11 +66,13 @@ class Predictor:
         return from_control_points(matrices, self.control)
 
 
-def spline_matrix(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+@lru_cache(MATRICES)
+def spline_matrix(nodes: tuple[float, ...], points: tuple[float, ...]) -> np.ndarray:
     """Return the matrix from values at nodes to values at points: natural cubic spline, linear beyond the nodes."""
     if len(nodes) == 1:
         return np.ones((len(points), 1))
     spline = CubicSpline(nodes, np.eye(len(nodes)), bc_type="natural")
     inside = np.clip(points, nodes[0], nodes[-1])
-    matrix: np.ndarray = spline(inside) + spline(inside, 1) * (points - inside)[:, None]
+    matrix: np.ndarray = spline(inside) + spline(inside, 1) * (np.asarray(points) - inside)[:, None]
+    matrix.flags.writeable = False  # callers share it
     return matrix
