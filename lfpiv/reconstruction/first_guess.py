@@ -9,6 +9,7 @@ import numpy as np
 from lfpiv.geometry.volume import in_order
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.first_guess import add_logarithms, exponentiate, give_light
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.transfer import DeviceArray, zeros
 
@@ -24,6 +25,9 @@ def multiplicative_guess(
     column_sum: DeviceArray,
     lit: DeviceArray,
     shown: Sequence[DeviceArray],
+    *,
+    rays: Sequence[tuple[int, int]] | None = None,
+    sums: DeviceArray | None = None,
 ) -> DeviceArray:
     """Return exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled so that its projections have the images' light.
 
@@ -39,6 +43,11 @@ def multiplicative_guess(
         1 for voxels that some camera sees, on the device. The others are zero.
     shown : sequence of array, shape (lit pixel,), float32
         1 for pixels that such a voxel lights, else 0, of each image, on the device.
+    rays : sequence of (int, int), optional
+        Indices of cameras and numbers of sets of their rays, over which both sums of the quotient are taken. Default:
+        all rays.
+    sums : array, shape (voxel,), float32, optional
+        sum_i w over `rays`, above 0 where voxels are lit, on the device. Default: `column_sum`.
 
     Returns
     -------
@@ -46,9 +55,10 @@ def multiplicative_guess(
         On the device.
     """
     logarithm = zeros(column_sum.size)
-    for comparison, peak in zip(comparisons, peaks, strict=True):
-        add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm)
-    guess = exponentiate(logarithm, column_sum, lit, FAINTEST)
+    for number, (comparison, peak) in enumerate(zip(comparisons, peaks, strict=True)):
+        sets = [ALL] if rays is None else [ray_set for camera, ray_set in rays if camera == number]
+        add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm, sets)
+    guess = exponentiate(logarithm, column_sum if sums is None else sums, lit, FAINTEST)
     give_light(guess, column_sum, comparisons, shown)
     return guess
 

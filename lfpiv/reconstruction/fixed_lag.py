@@ -71,8 +71,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     for steps, other in others.items():
         total = float(other.volume.sum(dtype=np.float64))
         if total > 0:
-            carried = motion.carried(other.spline, -steps, bright)
-            moved, inside = (values.ravel()[place] for values in carried)
+            moved, inside = motion.carried(other.spline, -steps, place)
             there = np.log(np.maximum(moved, 0) * np.float32(light / total) + dark)
             ratio += trust * np.where(inside > 0.5, inside, 0) * (there - logarithm)
     change = np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio)

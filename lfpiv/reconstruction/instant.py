@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -168,13 +169,21 @@ class PreparedInstant:
             settings=self.settings,
         )
 
+    def guess(self) -> Reconstruction:
+        """Return the first guess from the images alone, by the rays of `Normalisation.correcting`: without iterations.
+
+        It costs less than that by all rays, which `solve` starts from.
+        """
+        history = History(self.settings, 0)
+        history.append(Misfit(math.nan, math.nan))
+        return self._reconstruction(self.normalisation.sieve(self._from_part), history, SmartStop.DONE)
+
     def sampled_misfit(self, first: np.ndarray | None = None) -> float:
         """Return the misfit of a first guess (z, y, x) in a part of the rays [counts]; raise ValueError as `solve`.
 
-        It is scaled to the light of all rays. The part is `Normalisation.sample`, or all. Default: the guess from the
-        images.
+        It is scaled to the light of all rays. The part is `Normalisation.sample`, or all. Default: that of `guess`.
         """
-        guess = self._from_images if first is None else self._given(first)
+        guess = self._from_part if first is None else self._given(first)
         with self.equations.locked():
             return self._sampled(self.normalisation.sieve(guess)).divergence
 
@@ -216,10 +225,23 @@ class PreparedInstant:
     @cached_property
     def _from_images(self) -> DeviceArray:
         """First guess from the images alone, in stored order, on the device."""
+        return self._guessed()
+
+    @cached_property
+    def _from_part(self) -> DeviceArray:
+        """The same by the rays of `Normalisation.correcting`, where these are not all."""
+        normalisation = self.normalisation
+        if not normalisation.is_joint:
+            return self._from_images
+        return self._guessed(rays=normalisation.correcting.subsets[0].parts, sums=normalisation.correcting_sum)
+
+    def _guessed(self, **part: Any) -> DeviceArray:
+        """Return `multiplicative_guess` by all rays, or by a part of them."""
         peaks = [one.peak for one in self.recordings.values()]
         normalisation = self.normalisation
+        shown = normalisation.shown
         return multiplicative_guess(
-            self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit, normalisation.shown
+            self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit, shown, **part
         )
 
     @cached_property

@@ -32,6 +32,8 @@ COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 FOLLOWED_STEPS = 8
 """Number of steps by subsets of all cameras from the volume of the instant before, without a sieve."""
+LEAST_PART = 0.02
+"""Least share of a voxel's weights in the sum over a part of the rays. A part may not light each voxel."""
 LEAST_COLUMN_SUM = 0.02
 """Least sum of the weights of a voxel that some camera sees, as a share of the largest one. Smaller sums are those of
 voxels whose pixels are nearly all dead. Errors of the weights decide these sums, and steps divide by them."""
@@ -168,6 +170,19 @@ class Normalisation:
         rows = min(self._weights.projector(name).ray_sets for name in self._weights.cameras)
         parts, chosen = correcting_subset(cameras, rows)
         return self._joint_partition(parts).part(slice(chosen, chosen + 1))
+
+    @cached_property
+    def correcting_sum(self) -> DeviceArray:
+        """Sum of the weights of each voxel over the rays of `correcting`, shape (voxel,), float32.
+
+        It is at least `LEAST_PART` of the sum over all rays.
+        """
+        names, (subset,) = list(self._weights.cameras), self.correcting.subsets
+        total = np.zeros_like(self._column_sum)
+        for camera, ray_set in subset.parts:
+            gain = self._weights.gain(names[camera]) * self._camera_gains[camera]
+            self._weights.projector(names[camera]).back_project(gain, total, ray_set)
+        return to_device(np.maximum(total, LEAST_PART * self._column_sum), float)
 
     def _joint_partition(self, subsets: tuple[Subset, ...]) -> Partition:
         """Return subsets of all cameras. All have the same step, of another length each."""

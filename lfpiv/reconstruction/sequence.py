@@ -193,7 +193,7 @@ class SequenceSolver:
             return solved(Start.FIRST, FIRST_SHARE)
         if roughness(flow) > ROUGHEST:
             return solved(Start.UNRESOLVED, 1)
-        plain = prepared.solve(iterations=0, brief=True)
+        plain = prepared.guess()
         guess = _concentrated(predicted_guess(before.volume, plain, flow), plain)
         misfit = prepared.sampled_misfit(guess)
         if not misfit < prepared.sampled_misfit():

@@ -108,8 +108,8 @@ class MotionField:
         """Carry a volume, given by its spline coefficients, to the instant of a frame `steps` frames before its own.
 
         `steps` is negative for a frame after it. Returns the volume's light at the places of that frame's particles, 0
-        outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. Both are 0 where `wanted`,
-        shape (z, y, x), is 0.
+        outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. With `wanted`, flat indices
+        of voxels, both are those of these voxels alone, shape (voxel,).
         """
         field = followed(self.midway.control, self.midway.spacing, steps)
         return carry(coefficients, field, self.midway.spacing, wanted)

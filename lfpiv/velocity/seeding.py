@@ -51,9 +51,9 @@ def unseeded_voxels(volumes: Sequence[np.ndarray], without: np.ndarray | None = 
         peaks = _peaks(light)
         if not peaks.size:
             return None
-        limit = np.percentile(peaks, BRIGHT)
+        limit = np.float32(np.percentile(peaks, BRIGHT))
         peaks = np.minimum(peaks, limit).astype(float)
-        lights.append(np.minimum(light, limit).astype(np.float32))
+        lights.append(np.minimum(light, limit))
         counts.append(float(peaks.sum() ** 2 / np.square(peaks).sum()))  # particles of equal light
     extent = float(usable[1:-1, 1:-1, 1:-1].sum())  # where peaks are
     sigma = _averaging(extent, min(counts))
@@ -122,7 +122,8 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 def _binned(values: np.ndarray, cell: int) -> np.ndarray:
     """Return the means over cells of `cell` voxels along each axis; the last one of an axis may be longer."""
     for axis, n in enumerate(values.shape):
-        starts = np.arange(max(n // cell, 1)) * cell
-        lengths = np.diff(np.append(starts, n)).reshape([-1 if a == axis else 1 for a in range(3)])
-        values = np.add.reduceat(values, starts, axis) / lengths.astype(np.float32)
+        count = max(n // cell, 1)
+        own = np.minimum(np.arange(n) // cell, count - 1) == np.arange(count)[:, None]  # (cell, voxel)
+        mean = (own / own.sum(1, keepdims=True)).astype(np.float32)
+        values = np.moveaxis(np.tensordot(mean, values, (1, axis)), 0, axis)
     return values

@@ -5,6 +5,8 @@ field of displacements midway in time is turned into that of one frame's particl
 ``scipy.ndimage.map_coordinates``.
 """
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -56,32 +58,35 @@ def _share_inside(place: float, count: int):
 @wp.kernel
 def _carry(
     # in
-    coefficients: wp.array(dtype=float),  # spline coefficients of a volume, flat; a thread per voxel
+    coefficients: wp.array(dtype=float),  # spline coefficients of a volume, flat; a thread per wanted voxel
     shape: wp.vec3i,  # coefficients per axis, margin included
     field: wp.array3d(dtype=wp.vec3),  # displacement (z, y, x) [voxel] on the control grid
     spacing: wp.vec3,  # distance of control points [voxel], the first one at voxel (0, 0, 0)
     margin: int,
-    wanted: wp.array3d(dtype=float),  # 0 for voxels that are left out, (z, y, x), if there is any
-    first_layer: int,
+    wanted: wp.array(dtype=int),  # flat indices of voxels; none for all voxels
+    first: int,
     # out
-    carried_out: wp.array3d(dtype=float),  # volume at x + d, (z, y, x)
-    inside_out: wp.array3d(dtype=float),  # share of x + d within the volume
+    carried_out: wp.array(dtype=float),  # volume at x + d, per wanted voxel
+    inside_out: wp.array(dtype=float),  # share of x + d within the volume
 ):
-    layer, y, x = wp.tid()
-    z = first_layer + layer
+    k = first + wp.tid()
+    voxel = k
     if wanted.shape[0] > 0:
-        if wanted[z, y, x] == 0.0:
-            carried_out[z, y, x] = 0.0
-            inside_out[z, y, x] = 0.0
-            return
+        voxel = wanted[k]
+    rows = shape[1] - 2 * margin
+    columns = shape[2] - 2 * margin
+    row = voxel // columns
+    x = voxel - row * columns
+    z = row // rows
+    y = row - z * rows
     moved = at_place(field, float(z) / spacing[0], float(y) / spacing[1], float(x) / spacing[2])
     pz = float(z) + moved[0]
     py = float(y) + moved[1]
     px = float(x) + moved[2]
     wide = float(margin)
-    carried_out[z, y, x] = _sample(coefficients, shape, pz + wide, py + wide, px + wide)
-    within = _share_inside(pz, shape[0] - 2 * margin) * _share_inside(py, shape[1] - 2 * margin)
-    inside_out[z, y, x] = within * _share_inside(px, shape[2] - 2 * margin)
+    carried_out[k] = _sample(coefficients, shape, pz + wide, py + wide, px + wide)
+    within = _share_inside(pz, shape[0] - 2 * margin) * _share_inside(py, rows)
+    inside_out[k] = within * _share_inside(px, columns)
 
 
 def followed(midway: Values, spacing: tuple[float, float, float], steps: float) -> wp.array:
@@ -117,7 +122,7 @@ def carry(
     spacing: tuple[float, float, float],
     wanted: np.ndarray | None = None,
 ) -> tuple[Given, Given]:
-    """Sample a volume at ``x + d(x)`` for all voxels x.
+    """Sample a volume at ``x + d(x)`` for voxels x.
 
     Parameters
     ----------
@@ -127,16 +132,17 @@ def carry(
         Displacement d, order (z, y, x) [voxel], at control points, at least 2 per axis; linear between them.
     spacing : tuple of float
         Distance of the control points, order (z, y, x) [voxel]; the first lies on voxel (0, 0, 0).
-    wanted : ndarray, shape (z, y, x), float32, optional
-        0 for voxels that are left out: both results are 0 there. Default: all are wanted.
+    wanted : ndarray, shape (voxel,), int, optional
+        Flat indices of the voxels. Default: all voxels.
 
     Returns
     -------
-    carried : array, shape (z, y, x), float32
-        The volume at ``x + d(x)``. It falls smoothly to 0 outside. On the device if the coefficients are.
-    inside : array, shape (z, y, x), float32
-        1 where ``x + d(x)`` lies between the centres of the outer voxels, 0 where it lies a voxel beyond them or more,
-        linear between.
+    carried : array, float32
+        The volume at ``x + d(x)``, shape (z, y, x), or (voxel,) with `wanted`. It falls smoothly to 0 outside. On the
+        device if the coefficients are.
+    inside : array, float32
+        Of the same shape: 1 where ``x + d(x)`` lies between the centres of the outer voxels, 0 where it lies a voxel
+        beyond them or more, linear between.
 
     Raises
     ------
@@ -145,11 +151,11 @@ def carry(
     """
     if (isinstance(field, np.ndarray) and field.shape[3:] != (3,)) or min(field.shape[:3]) < 2:
         raise ValueError(f"field: expected shape (>= 2, >= 2, >= 2, 3), got {field.shape}.")
-    shape = tuple(n - 2 * MARGIN for n in coefficients.shape)
+    shape = tuple(n - 2 * MARGIN for n in coefficients.shape) if wanted is None else wanted.shape
     outputs = [empty_volume(shape) for _ in range(2)]
     control = to_device(np.ascontiguousarray(field, np.float32) if isinstance(field, np.ndarray) else field, wp.vec3)
-    mask = None if wanted is None else on_device(wanted)
+    places = None if wanted is None else to_device(wanted.astype(np.int32), int)
     flat, shape_3i = on_device(coefficients).flatten(), wp.vec3i(*coefficients.shape)
-    inputs = [flat, shape_3i, control, wp.vec3(*spacing), MARGIN, mask]
-    launch(Call(_carry, shape[0], inputs, outputs, inner=shape[1:]))
+    inputs = [flat, shape_3i, control, wp.vec3(*spacing), MARGIN, places]
+    launch(Call(_carry, math.prod(shape), inputs, [one.flatten() for one in outputs]))
     return as_given(outputs[0], coefficients), as_given(outputs[1], coefficients)

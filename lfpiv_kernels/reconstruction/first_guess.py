@@ -105,8 +105,11 @@ def _rescale(
     guess_out[voxel] = guess_out[voxel] * float(totals[0] / totals[1])
 
 
-def add_logarithms(comparison: Comparison, floor: float, out: wp.array) -> None:
-    """Add the back projection of gain * log(1 + image / floor) to `out`, shape (voxel,)."""
+def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets: Sequence[int] = ()) -> None:
+    """Add the back projection of gain * log(1 + image / floor) to `out`, shape (voxel,), by the rays of some sets.
+
+    Without `ray_sets` all rays count.
+    """
     image = empty(comparison.size)
     pixel = comparison.projector.map.rays.pixel
     if runtime.device().form == "cpu":
@@ -119,7 +122,7 @@ def add_logarithms(comparison: Comparison, floor: float, out: wp.array) -> None:
     else:
         inputs = [pixel, comparison.image, comparison.gain, float(floor)]
         launch(Call(_logarithm, pixel.size, inputs, [image]))
-    comparison.projector.back_project(image, out)
+    comparison.projector.back_project(image, out, *ray_sets)
 
 
 def exponentiate(logarithm: wp.array, column_sum: wp.array, lit: wp.array, faintest: float) -> wp.array:

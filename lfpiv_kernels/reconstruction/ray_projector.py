@@ -108,15 +108,17 @@ class RayProjector:
         overwrite(out, image)
         return out
 
-    def back_project(self, image: Values, out: Given, ray_set: int = ALL) -> Given:
+    def back_project(self, image: Values, out: Given, *ray_sets: int) -> Given:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
-        Rays of other sets do not count. Return `out`.
+        Only rays of the sets count; without `ray_sets` all rays. Return `out`.
         """
         with self.reserved():
             self.darken()
             self.map.spread(to_device(image, float), self.returned)
-            return self.gather(out, ray_set=ray_set)
+            for ray_set in ray_sets or (ALL,):
+                self.gather(out, ray_set=ray_set)
+        return out
 
     def see_only(self, ray_set: int) -> np.ndarray:
         """Return the sensor pixels that see light by rays of one set and of no other one, shape (pixel,), int32."""

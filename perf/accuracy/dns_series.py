@@ -44,6 +44,7 @@ from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.update import Comparison
 
 TITLE = "Time series of a turbulent flow"
 
@@ -145,9 +146,10 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
         counts.passes += sum(half_of(self, *one) for one in parts)  # the comparisons are counted by themselves
         return of(self, parts, *arguments)
 
-    def guess(of: Any, views: Sequence[Any], *arguments: Any) -> Any:
-        counts.passes += len(views) == cameras
-        return of(views, *arguments)
+    def guess(of: Any, views: Sequence[Comparison], *arguments: Any, **part: Any) -> Any:
+        of_all = sum(view.projector.ray_sets for view in views)
+        counts.passes += (len(part["rays"]) / of_all if part else 1) * (len(views) == cameras)
+        return of(views, *arguments, **part)
 
     def timed(of: Any, *arguments: Any) -> Any:
         start = time.process_time()
