@@ -95,7 +95,7 @@ def _sees(camera: CalibratedCamera, grid: Grid) -> np.ndarray:
 def warn_seen_by_one(camera_counts: np.ndarray, grid: Grid, cameras: int) -> None:
     """Log a warning where only one of several cameras sees voxels. `camera_counts` has the shape (z, y, x)."""
     if cameras > 1:
-        for warning in _seen_by_one(camera_counts, [grid.axis_mm(axis) for axis in range(3)]):
+        for warning in _seen_by_one(camera_counts, grid.axes_mm):
             log.warning("%s", warning.sentence)
 
 

@@ -81,13 +81,18 @@ class Grid:
         """Return the voxel centres along one axis (0: z, 1: y, 2: x) [mm]."""
         return self.first_centre_mm[axis] + self.voxel_mm * np.arange(self.shape[axis])
 
+    @property
+    def axes_mm(self) -> list[np.ndarray]:
+        """The voxel centres along z, y and x [mm]."""
+        return [self.axis_mm(axis) for axis in range(3)]
+
     def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
         """Return the voxel centres along z, y, x as coordinates of a DataArray [mm]."""
         return {name: (name, self.axis_mm(axis), {"units": "mm"}) for axis, name in enumerate(AXES)}
 
     def centres_mm(self) -> np.ndarray:
         """Return all voxel centres (x, y, z), in C order of the axes (z, y, x) [mm], shape (voxel, 3)."""
-        z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in range(3)), indexing="ij")
+        z, y, x = np.meshgrid(*self.axes_mm, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def padded(self, layers: Layers) -> Grid:

@@ -28,6 +28,7 @@ from lfpiv.reconstruction.resting_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.sieve import coefficients
+from lfpiv_kernels import runtime
 
 SHARPNESS = 1.3
 """Exponent S of the mean's ratio to the volume."""
@@ -65,16 +66,23 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     blurred = own.blurred
     dark = np.float32(DARK_SHARE * np.square(blurred, dtype=np.float64).sum() / blurred.sum(dtype=np.float64))
     place = np.flatnonzero(bright)
-    logarithm, ratio = np.log(blurred.ravel()[place] + dark), np.zeros(len(place), np.float32)
-    motion = MotionField(own.to_dataarray(), flow)
+    logarithm = np.log(blurred.ravel()[place] + dark)
+    motion = MotionField(own.grid.axes_mm, flow)
     trust = motion.trust.ravel()[place]
-    for steps, other in others.items():
-        total = float(other.volume.sum(dtype=np.float64))
-        if total > 0:
-            moved, inside = motion.carried(other.spline, -steps, place)
-            there = np.log(np.maximum(moved, 0) * np.float32(light / total) + dark)
-            ratio += trust * np.where(inside > 0.5, inside, 0) * (there - logarithm)
-    change = np.exp(np.float32(SHARPNESS / (len(others) + 1)) * ratio)
+    steps = list(others)
+    ratios = [np.float32(0)] * len(steps)
+
+    def compare(_: int, first: int, last: int) -> None:
+        for number in range(first, last):
+            other = others[steps[number]]
+            total = float(other.volume.sum(dtype=np.float64))
+            if total > 0:
+                moved, inside = motion.carried(other.spline, -steps[number], place)
+                there = np.log(np.maximum(moved, 0) * np.float32(light / total) + dark)
+                ratios[number] = trust * np.where(inside > 0.5, inside, 0) * (there - logarithm)
+
+    runtime.run_chunks(len(steps), compare, chunks=len(steps))
+    change = np.exp(np.float32(SHARPNESS / (len(others) + 1)) * sum(ratios))
     gain = np.zeros_like(volume)
     gain.ravel()[place] = np.minimum(change, np.float32(LARGEST_GAIN))
     guess: np.ndarray = coefficients(bright, own.sieve_voxel) * gain

@@ -68,7 +68,7 @@ def _near(first: xr.DataArray, second: xr.DataArray, correlation: Mapping[str, A
     windows = windows_of(correlation["windows"], triple(first.shape))
     settings = CorrelationSettings(**{**correlation, "windows": windows})
     pair = checked.prepared(settings)
-    midway = MotionField(first, known).midway
+    midway = MotionField([first[axis].values for axis in AXES], known).midway
     last = pair.without_standing_light(correlate_known(pair.first, pair.second, settings, pair.voxels, midway))
     axes, coordinates = checked.axes, {}
     for axis, voxels, spacing, centres in zip(AXES, axes.centres, axes.spacing, last.given.centres, strict=True):

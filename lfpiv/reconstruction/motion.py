@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import DEFAULTS, SmartSettings, require_whole
@@ -283,7 +284,7 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
     settings = CorrelationSettings.of(vectors)
     if len(settings.windows) == 1 or not vectors["valid"].any():
         return vectors
-    motion, window = MotionField(volumes[0], vectors), settings.windows[-1]
+    motion, window = MotionField([volumes[0][axis].values for axis in AXES], vectors), settings.windows[-1]
     missing = missing_smoothing(settings.smoothing_voxel, *volumes)
     unshared = (volume[UNSHARED].values for volume in volumes)  # their scale does not matter
     first, second = (

@@ -175,14 +175,14 @@ def _dead_and_lit(weights: Weights, name: str) -> tuple[np.ndarray, np.ndarray]:
     return dead, pixels
 
 
-def _shared(weights: Weights, name: str) -> np.ndarray:
-    """Return which of the lit pixels of a camera show only what all cameras see: indices into `_LitPixels.counts`."""
+def _shared(weights: Weights, name: str, shared: np.ndarray) -> np.ndarray:
+    """Return where the pixels of `EvenLight.shared` are among a camera's lit ones: indices into `_LitPixels.counts`."""
     derived, key = weights.derived, ("shared pixels", name)
     if key not in derived:
         _, pixels = _dead_and_lit(weights, name)
-        derived[key] = np.flatnonzero(weights.even_light[name].shared[pixels])
-    shared: np.ndarray = derived[key]
-    return shared
+        derived[key] = np.flatnonzero(shared[pixels])
+    indices: np.ndarray = derived[key]
+    return indices
 
 
 def _median_and_peak(counts: np.ndarray) -> tuple[float, float]:
@@ -231,9 +231,9 @@ def _camera_gains(weights: Weights, lit: Mapping[str, _LitPixels]) -> dict[str, 
     for name, seen in lit.items():
         if name not in even:
             return equal
-        counts = seen.without_glare
-        if even[name].shared is not None:
-            counts, all_see_all = counts[_shared(weights, name)], False
+        counts, shared = seen.without_glare, even[name].shared
+        if shared is not None:
+            counts, all_see_all = counts[_shared(weights, name, shared)], False
         # positive and negative noise cancel in the sum
         light = float(counts.sum(dtype=np.float64)) + seen.cut_off * np.count_nonzero(counts == 0)
         if not light > LEAST_LIGHT * seen.noise * len(counts):

@@ -287,7 +287,7 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
         With the light of the guess from the images; zero where that is zero.
     """
     own, light = plain.volume, float(plain.volume.sum(dtype=np.float64))
-    motion = MotionField(plain.to_dataarray(), flow)
+    motion = MotionField(plain.grid.axes_mm, flow)
     moved, inside = motion.carried(deform.spline_coefficients(volume), -1)
     np.maximum(moved, 0, out=moved)
     total = float(moved.sum(dtype=np.float64))

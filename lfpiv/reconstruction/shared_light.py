@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 import xarray as xr
 
+from lfpiv.geometry.grid import AXES
 from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.validation import fill
 from lfpiv_kernels.correlation import deform, light
@@ -56,7 +57,7 @@ def shared_guesses(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> list
     values = [np.asarray(volume.values, np.float32) for volume in volumes]
     total = [float(value.sum(dtype=np.float64)) for value in values]
     coefficients = [deform.spline_coefficients(value) for value in values]
-    motion = MotionField(volumes[0], vectors)
+    motion = MotionField([volumes[0][axis].values for axis in AXES], vectors)
     guesses = []
     for number, own in enumerate(values):
         partner, inside = motion.carried(coefficients[1 - number], 1 if number == 0 else -1)
@@ -79,17 +80,17 @@ class MotionField:
 
     Parameters
     ----------
-    volume : DataArray, shape (z, y, x)
-        One of the frames, with coordinates in mm.
+    centres_mm : sequence of three ndarrays
+        Voxel centres of the frames along z, y, x [mm].
     vectors : Dataset
         From `correlate`, of volumes whose voxels may have another size.
     """
 
-    def __init__(self, volume: xr.DataArray, vectors: xr.Dataset):
-        axes = [(volume[axis].values.astype(float), vectors[axis].values) for axis in "zyx"]
+    def __init__(self, centres_mm: Sequence[np.ndarray], vectors: xr.Dataset):
+        axes = [(own.astype(float), vectors[axis].values) for axis, own in zip(AXES, centres_mm, strict=True)]
         self.nodes = [(centres - own[0]) * (len(own) - 1) / (own[-1] - own[0]) for own, centres in axes]
         """Positions of the vectors along each axis [voxel]."""
-        nz, ny, nx = volume.shape
+        nz, ny, nx = (len(own) for own, _ in axes)
         displacement = np.stack([vectors[f"displacement_{axis}"].values for axis in "zyx"], axis=-1).astype(float)
         displacement = fill(displacement, np.isfinite(displacement).all(-1))  # masked vectors have none
         edges = [(own[-1] - own[0]) / (len(own) - 1) for own, _ in axes]
@@ -97,7 +98,7 @@ class MotionField:
         self.midway = Predictor.between(self.nodes, displacement, (nz, ny, nx))
         """Displacement of what is at a control point midway in time."""
         trust = vectors["valid"].values.astype(float)
-        for axis, (nodes, count) in enumerate(zip(self.nodes, volume.shape, strict=True)):
+        for axis, (nodes, count) in enumerate(zip(self.nodes, (nz, ny, nx), strict=True)):
             trust = np.moveaxis(np.tensordot(_linear(tuple(nodes), count), trust, (1, axis)), 0, axis)
         self.trust = trust.astype(np.float32)
         """1 among valid vectors, 0 among replaced ones, shape (z, y, x)."""

@@ -50,7 +50,7 @@ class SmartSolver:
         self.weights = weights
         self.settings = settings
         grid = weights.grid
-        self.solid = None if mask is None else checked_mask(mask, [grid.axis_mm(axis) for axis in range(3)])
+        self.solid = None if mask is None else checked_mask(mask, grid.axes_mm)
         """True for voxels without fluid, shape (z, y, x); None without a mask."""
         self._last: tuple[tuple[object, ...], Normalisation] | None = None
 

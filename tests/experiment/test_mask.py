@@ -24,7 +24,7 @@ def ball(points, radius=0.17):
 
 
 def places(grid=GRID):
-    z, y, x = np.meshgrid(*(grid.axis_mm(axis) for axis in range(3)), indexing="ij")
+    z, y, x = np.meshgrid(*grid.axes_mm, indexing="ij")
     return np.stack([x, y, z], -1)
 
 

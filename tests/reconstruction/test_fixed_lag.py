@@ -30,12 +30,9 @@ def blobs(positions):
 
 
 def reconstruction(volume, sieve_voxel=0.0):
-    array = xr.DataArray(volume, dims=("z", "y", "x"), coords=GRID.coordinates())
     blurred = ndimage.gaussian_filter(volume, SMOOTHING_VOXEL, mode="constant")
     spline = deform.spline_coefficients(blurred)
-    return SimpleNamespace(
-        volume=volume, blurred=blurred, spline=spline, sieve_voxel=sieve_voxel, to_dataarray=lambda: array
-    )
+    return SimpleNamespace(grid=GRID, volume=volume, blurred=blurred, spline=spline, sieve_voxel=sieve_voxel)
 
 
 def flow_of(displacement_voxel, valid=True):
@@ -52,7 +49,7 @@ def flow_of(displacement_voxel, valid=True):
 
 def light_at(volume, position):
     """Light within two voxels of a point, and its centroid [voxel]."""
-    z, y, x = np.meshgrid(*(GRID.axis_mm(axis) for axis in range(3)), indexing="ij")
+    z, y, x = np.meshgrid(*GRID.axes_mm, indexing="ij")
     near = np.where((x - position[0]) ** 2 + (y - position[1]) ** 2 + (z - position[2]) ** 2 < 0.25**2, volume, 0)
     return near.sum(), np.array([(near * at).sum() / near.sum() for at in (x, y, z)]) / GRID.voxel_mm
 
