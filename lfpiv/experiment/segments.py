@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from lfpiv.settings.particles import Series
 
-SEGMENT = 32
+SEGMENT = 64
 """Number of instants of a segment. The number of its first one is a multiple of it."""
 LEAD_IN = 6
 """Largest number of instants before a segment that lead into it."""

@@ -4,18 +4,21 @@ import numpy as np
 import pytest
 from support.noisy_blobs import noisy_blobs
 
+from lfpiv.reconstruction.first_guess import FAINTEST, LEAST_FLOOR_SHARE
 from lfpiv.reconstruction.normalisation import COMPARED, FOLLOWED_STEPS
 from lfpiv.reconstruction.ordered_subsets import CORRECTING, FEWEST_ROWS, Subset, correcting_subset, joint_subsets
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights import separable
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
-from lfpiv_kernels.transfer import to_device
+from lfpiv_kernels.transfer import to_device, to_host
 
 SIEVES = (0.6, 0.0)
 TOLERANCE_SAMPLE = 0.1  # misfits of some ray rows stand for those of all; rows differ by their noise and their pupil
 TOLERANCE_ROW = 0.3  # of a single row at the edge of the pupil; without scaling it would be a fifteenth
 TOLERANCE_F32 = 2e-5  # a truth in float32 against its own images, after some steps
+TOLERANCE_LIGHT = 0.02  # light of projections of two guesses: voxels at the faces are seen by few rows
+ALIKE = 0.95  # correlation of guesses by a quarter of the rays and by all
 FADED = 0.7  # brightness of each other particle in a guess
 GAIN = 0.5  # error of the particles' brightness that is left after the steps: 0.2 to 0.35 here
 
@@ -105,6 +108,37 @@ def test_a_momentum_that_begins_later_makes_longer_first_steps(recorded):
     exponent = 1 / ((1 + np.sqrt(17)) / 2)  # (t - 1) / t' for t = 2
     ratio = np.log(longer[lit] / guess[lit]) / np.log(plain[lit] / guess[lit])
     assert np.median(ratio) == pytest.approx(1 + exponent, rel=1e-3)
+
+
+@pytest.mark.parametrize("sieve_voxel", SIEVES)
+def test_a_guess_by_a_part_of_the_rays_equals_its_twin(recorded, sieve_voxel):
+    """expm1 of the mean logarithm of the pixels that these rays see, brightened to the light of all images."""
+    weights = recorded[0]
+    prepared = prepared_from(recorded, sieve_voxel)
+    normal, whole, found = prepared.normalisation, prepared.solve(iterations=0), prepared.guess()
+    if not weights.has_ray_rows:
+        np.testing.assert_array_equal(found.volume, whole.volume)
+        return
+    names, (subset,) = list(weights.cameras), normal.correcting.subsets
+    logarithm, total = (np.zeros(weights.grid.size, np.float32) for _ in range(2))
+    for camera, ray_set in subset.parts:
+        one, projector = prepared.recordings[names[camera]], weights.projector(names[camera])
+        gain = weights.gain(names[camera]) * np.float32(one.camera_gain)
+        floor = max(one.floor, LEAST_FLOOR_SHARE * one.peak)
+        projector.back_project(gain * np.log1p(one.image / np.float32(floor)), logarithm, ray_set)
+        projector.back_project(gain, total, ray_set)
+    lit = to_host(normal.lit) > 0
+    assert 0.1 < total.sum() / to_host(normal.column_sum).sum() < 0.5 and (total[lit] > 0).all()
+    expected = np.expm1(np.divide(logarithm, total, out=np.zeros_like(total), where=lit))
+    expected = np.where(lit, np.maximum(expected, FAINTEST * expected.max()), 0)
+    expected = prepared.stored.restore(to_host(normal.sieve(to_device(expected.astype(np.float32), float))))
+    light = whole.volume.sum(dtype=float)
+    assert found.volume.sum(dtype=float) == pytest.approx(light, rel=TOLERANCE_LIGHT)
+    expected *= found.volume.sum(dtype=float) / expected.sum(dtype=float)
+    np.testing.assert_allclose(found.volume, expected, atol=TOLERANCE_F32 * expected.max())
+    assert np.corrcoef(found.volume.ravel(), whole.volume.ravel())[0, 1] > ALIKE
+    if sieve_voxel == 0:  # it would be blurred once more
+        assert prepared.sampled_misfit() == pytest.approx(prepared.sampled_misfit(found.volume), rel=TOLERANCE_F32)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 5, 7, 9, 11, 12, 15, 30])
