@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -233,15 +232,13 @@ class PreparedInstant:
         normalisation = self.normalisation
         if not normalisation.is_joint:
             return self._from_images
-        return self._guessed(rays=normalisation.correcting.subsets[0].parts, sums=normalisation.correcting_sum)
+        return self._guessed(normalisation.correcting.subsets[0].parts, normalisation.correcting_sum)
 
-    def _guessed(self, **part: Any) -> DeviceArray:
-        """Return `multiplicative_guess` by all rays, or by a part of them."""
-        peaks = [one.peak for one in self.recordings.values()]
-        normalisation = self.normalisation
-        shown = normalisation.shown
+    def _guessed(self, rays: Sequence[tuple[int, int]] | None = None, sums: DeviceArray | None = None) -> DeviceArray:
+        """Return `multiplicative_guess` by all rays, or by some that have these sums of weights."""
+        peaks, normal = [one.peak for one in self.recordings.values()], self.normalisation
         return multiplicative_guess(
-            self.equations.comparisons, peaks, normalisation.column_sum, normalisation.lit, shown, **part
+            self.equations.comparisons, peaks, normal.column_sum, normal.lit, normal.shown, rays=rays, sums=sums
         )
 
     @cached_property

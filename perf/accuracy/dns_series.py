@@ -148,7 +148,8 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
 
     def guess(of: Any, views: Sequence[Comparison], *arguments: Any, **part: Any) -> Any:
         of_all = sum(view.projector.ray_sets for view in views)
-        counts.passes += (len(part["rays"]) / of_all if part else 1) * (len(views) == cameras)
+        share = 1 if part.get("rays") is None else len(part["rays"]) / of_all
+        counts.passes += share * (len(views) == cameras)
         return of(views, *arguments, **part)
 
     def timed(of: Any, *arguments: Any) -> Any:
