@@ -19,7 +19,6 @@ EDGE = 1e-6
 """Tolerance of places at the faces of a grid [voxel]."""
 SMOOTH_VOXEL = 0.5
 """Least standard deviation of Gaussians of which a volume is made that samples of it represent well [voxel]."""
-
 MATRICES = 6
 """Number of matrices that are kept: those of the axes of two grids."""
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lfpiv.geometry.volume import in_order
+from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.first_guess import add_logarithms, exponentiate, give_light
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
@@ -26,7 +27,7 @@ def multiplicative_guess(
     lit: DeviceArray,
     shown: Sequence[DeviceArray],
     *,
-    rays: Sequence[tuple[int, int]] | None = None,
+    subset: Subset | None = None,
     sums: DeviceArray | None = None,
 ) -> DeviceArray:
     """Return exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled so that its projections have the images' light.
@@ -43,11 +44,10 @@ def multiplicative_guess(
         1 for voxels that some camera sees, on the device. The others are zero.
     shown : sequence of array, shape (lit pixel,), float32
         1 for pixels that such a voxel lights, else 0, of each image, on the device.
-    rays : sequence of (int, int), optional
-        Indices of cameras and numbers of sets of their rays, over which both sums of the quotient are taken. Default:
-        all rays.
+    subset : Subset, optional
+        Rays of all cameras, over whose pixels i both sums of the quotient are taken. Default: all rays.
     sums : array, shape (voxel,), float32, optional
-        sum_i w over `rays`, above 0 where voxels are lit, on the device. Default: `column_sum`.
+        sum_i w over the subset, above 0 where voxels are lit, on the device. Default: `column_sum`.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def multiplicative_guess(
     """
     logarithm = zeros(column_sum.size)
     for number, (comparison, peak) in enumerate(zip(comparisons, peaks, strict=True)):
-        sets = [ALL] if rays is None else [ray_set for camera, ray_set in rays if camera == number]
+        sets = [ALL] if subset is None else subset.sets_of(number)
         add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm, sets)
     guess = exponentiate(logarithm, column_sum if sums is None else sums, lit, FAINTEST)
     give_light(guess, column_sum, comparisons, shown)

@@ -169,9 +169,9 @@ class PreparedInstant:
         )
 
     def guess(self) -> Reconstruction:
-        """Return the first guess from the images alone, by the rays of `Normalisation.correcting`: without iterations.
+        """Return a first guess from the images alone, without iterations.
 
-        It costs less than that by all rays, which `solve` starts from.
+        It takes the rays of `Normalisation.correcting`, and so less time than the guess that `solve` starts from.
         """
         history = History(self.settings, 0)
         history.append(Misfit(math.nan, math.nan))
@@ -228,17 +228,17 @@ class PreparedInstant:
 
     @cached_property
     def _from_part(self) -> DeviceArray:
-        """The same by the rays of `Normalisation.correcting`, where these are not all."""
+        """First guess by the rays of `Normalisation.correcting`, in stored order, on the device."""
         normalisation = self.normalisation
         if not normalisation.is_joint:
             return self._from_images
-        return self._guessed(normalisation.correcting.subsets[0].parts, normalisation.correcting_sum)
+        return self._guessed(normalisation.correcting.subsets[0], normalisation.correcting_sum)
 
-    def _guessed(self, rays: Sequence[tuple[int, int]] | None = None, sums: DeviceArray | None = None) -> DeviceArray:
-        """Return `multiplicative_guess` by all rays, or by some that have these sums of weights."""
+    def _guessed(self, subset: Subset | None = None, sums: DeviceArray | None = None) -> DeviceArray:
+        """Return `multiplicative_guess` of the images by all rays, or by a subset with its sums of weights."""
         peaks, normal = [one.peak for one in self.recordings.values()], self.normalisation
         return multiplicative_guess(
-            self.equations.comparisons, peaks, normal.column_sum, normal.lit, normal.shown, rays=rays, sums=sums
+            self.equations.comparisons, peaks, normal.column_sum, normal.lit, normal.shown, subset=subset, sums=sums
         )
 
     @cached_property

@@ -177,11 +177,10 @@ class Normalisation:
 
         It is at least `LEAST_PART` of the sum over all rays.
         """
-        names, (subset,) = list(self._weights.cameras), self.correcting.subsets
-        total = np.zeros_like(self._column_sum)
-        for camera, ray_set in subset.parts:
-            gain = self._weights.gain(names[camera]) * self._camera_gains[camera]
-            self._weights.projector(names[camera]).back_project(gain, total, ray_set)
+        (subset,), total = self.correcting.subsets, np.zeros_like(self._column_sum)
+        for camera, name in enumerate(self._weights.cameras):
+            gain = self._weights.gain(name) * self._camera_gains[camera]
+            self._weights.projector(name).back_project(gain, total, *subset.sets_of(camera))
         return to_device(np.maximum(total, LEAST_PART * self._column_sum), float)
 
     def _joint_partition(self, subsets: tuple[Subset, ...]) -> Partition:
@@ -251,9 +250,8 @@ def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[
     for subset, own in zip(subsets, least, strict=True):
         for camera, name in enumerate(names):
             sums = np.zeros_like(excess)
-            for of, ray_set in subset.parts:
-                if of == camera:
-                    sums += weights.sums_of_set(name, ray_set)
+            for ray_set in subset.sets_of(camera):
+                sums += weights.sums_of_set(name, ray_set)
             of_all = weights.camera_sums[camera]
             share = np.divide(count * sums, of_all, out=np.zeros_like(sums), where=of_all > 0)
             np.maximum(excess, share / np.float32(own), out=excess)

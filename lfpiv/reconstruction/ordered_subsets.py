@@ -83,6 +83,10 @@ class Subset:
     parts: tuple[tuple[int, int], ...]
     """Index of a camera and number of a set of its rays, or ``ALL``, for each camera that takes part."""
 
+    def sets_of(self, camera: int) -> list[int]:
+        """Return the numbers of the sets of one camera's rays."""
+        return [ray_set for of, ray_set in self.parts if of == camera]
+
 
 @dataclass(frozen=True)
 class Partition:

@@ -105,11 +105,8 @@ def _rescale(
     guess_out[voxel] = guess_out[voxel] * float(totals[0] / totals[1])
 
 
-def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets: Sequence[int] = ()) -> None:
-    """Add the back projection of gain * log(1 + image / floor) to `out`, shape (voxel,), by the rays of some sets.
-
-    Without `ray_sets` all rays count.
-    """
+def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets: Sequence[int]) -> None:
+    """Add the back projection of gain * log(1 + image / floor) by sets of rays to `out`, shape (voxel,)."""
     image = empty(comparison.size)
     pixel = comparison.projector.map.rays.pixel
     if runtime.device().form == "cpu":

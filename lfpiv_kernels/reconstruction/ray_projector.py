@@ -111,7 +111,7 @@ class RayProjector:
     def back_project(self, image: Values, out: Given, *ray_sets: int) -> Given:
         """Add the weighted sum of `image`, shape (pixel,), over each voxel's pixels to `out`, shape (voxel,).
 
-        Only rays of the sets count; without `ray_sets` all rays. Return `out`.
+        Only the rays of `ray_sets` count, all rays where no set is given. Return `out`.
         """
         with self.reserved():
             self.darken()

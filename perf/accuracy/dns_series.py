@@ -148,7 +148,7 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
 
     def guess(of: Any, views: Sequence[Comparison], *arguments: Any, **part: Any) -> Any:
         of_all = sum(view.projector.ray_sets for view in views)
-        share = 1 if part.get("rays") is None else len(part["rays"]) / of_all
+        share = 1 if part.get("subset") is None else len(part["subset"].parts) / of_all
         counts.passes += share * (len(views) == cameras)
         return of(views, *arguments, **part)
 
