@@ -1,11 +1,9 @@
-"""Version of this package, and of the libraries that its numbers depend on."""
+"""Version of this package, and of the libraries that its numbers depend on.
+
+The package imports this module first, so it imports nothing that takes time.
+"""
 
 from __future__ import annotations
-
-import contextlib
-import importlib.metadata
-import platform
-from datetime import UTC, datetime
 
 __version__ = "0.1.0"
 
@@ -19,14 +17,21 @@ def history(earlier: str = "") -> str:
 
     The line has no arguments of the command: they name folders of the machine.
     """
-    return "\n".join([*earlier.splitlines(), f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {SOURCE}"])
+    from datetime import datetime, timezone
+
+    return "\n".join([*earlier.splitlines(), f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {SOURCE}"])
 
 
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the libraries that its numbers depend on."""
+    import importlib.metadata
+    import platform
+
     names = ("numpy", "scipy", "taichi", "warp-lang", "xarray", "opencv-python-headless", "scikit-learn")
     found = {"lfpiv": __version__, "python": platform.python_version()}
     for name in names:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        try:
             found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
     return found

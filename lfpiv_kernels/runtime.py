@@ -137,7 +137,7 @@ def _start(request: str, threads: int | None) -> Device:
     form = "gpu" if kind == "cuda" or native.EMULATED else "cpu"
     count = 1 if native.EMULATED else threads or cores()  # a GPU adds atomically, the CPU's threads do not
 
-    import taichi as ti
+    from lfpiv_kernels.libraries import ti
 
     compiled = caches.taichi_folder()
     _taichi_folder = None if caches.verify_taichi(compiled) else compiled

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import os
-import signal
 import sys
 import threading
 import traceback
@@ -15,8 +13,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lfpiv.cli import benchmark, init, terminal
-from lfpiv.cli.terminal import Interrupted
+from lfpiv.cli import benchmark, init, interrupts, terminal
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
 from lfpiv.version import __version__
@@ -81,7 +78,10 @@ def _command(
     def register(function: Callable[..., None]) -> Callable[..., None]:
         def command(quiet: Quiet = False, as_json: Json = False, debug: Debug = False, **options: Any) -> None:
             _output.quiet, _output.json, _output.debug = quiet, as_json, _output.debug or debug
-            function(**options)
+            try:
+                function(**options)
+            except KeyboardInterrupt as error:
+                raise interrupts.Interrupted from error
 
         own, common = (inspect.signature(one, eval_str=True) for one in (function, command))
         parameters = [*own.parameters.values(), *list(common.parameters.values())[:-1]]
@@ -362,11 +362,9 @@ def _doctor(device: Literal["auto", "cpu", "cuda"] = "auto") -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and end the process with its exit status."""
-    with contextlib.suppress(ValueError):  # handlers need the main thread
-        signal.signal(signal.SIGTERM, _terminate)
-        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
-            signal.signal(signal.SIGHUP, _terminate)
+    interrupts.watch()
     status = call(arguments)
+    interrupts.end_with(status)
     last = threading.Timer(EXIT_S, os._exit, (status,))  # threads of a library may wait for something that never comes
     last.daemon = True
     last.start()
@@ -380,12 +378,15 @@ def call(arguments: Sequence[str] | None = None) -> int:
     """
     _output.debug = _output.quiet = _output.json = False
     try:
-        status = app(args=None if arguments is None else list(arguments), prog_name="lfpiv", standalone_mode=False)
+        with interrupts.raised():
+            status = app(args=None if arguments is None else list(arguments), prog_name="lfpiv", standalone_mode=False)
+        if status == interrupts.PARSED:
+            raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except InputError as error:
         return _fail(2, str(error), error)
-    except (Interrupted, KeyboardInterrupt, typer.Abort) as error:
-        return _fail(1, "interrupted. Finished results are complete; the same command goes on from there.", error)
+    except (interrupts.Interrupted, KeyboardInterrupt, typer.Abort) as error:
+        return _fail(1, interrupts.MESSAGE, error)
     except (StorageError, ClusterError) as error:
         return _fail(1, str(error), error)
     except MemoryError as error:
@@ -403,10 +404,6 @@ def _fail(status: int, message: str, error: BaseException | None) -> int:
         traceback.print_exception(error)
     print(f"lfpiv: {printable(' '.join(message.split()))}", file=sys.stderr)
     return status
-
-
-def _terminate(signum: int, frame: Any) -> None:
-    raise KeyboardInterrupt
 
 
 def _end(summary: dict[str, Any]) -> None:

@@ -36,10 +36,6 @@ LISTED_WARNINGS = 20
 """Largest number of warnings listed at the end of a run. ``summary.json`` contains all."""
 
 
-class Interrupted(Exception):
-    """Interruption by Ctrl-C or a signal, as an exception that the command line parser does not handle."""
-
-
 @dataclass
 class Output:
     """Options for the output of a command."""
@@ -84,8 +80,6 @@ class Output:
                     yield update
             else:
                 yield _log_lines()
-        except KeyboardInterrupt as error:
-            raise Interrupted from error
         finally:
             for logger in loggers:
                 logger.removeHandler(handler)

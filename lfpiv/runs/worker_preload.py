@@ -8,7 +8,6 @@ import dask.array
 import distributed
 import h5netcdf
 import imagecodecs
-import taichi
 import tifffile
 import warp
 
@@ -17,3 +16,4 @@ from lfpiv.reconstruction import motion
 from lfpiv.runs import dispatch, worker
 from lfpiv.velocity import cross_correlation
 from lfpiv.weights import storage
+from lfpiv_kernels.libraries import ti

@@ -5,9 +5,9 @@ is so smooth that evaluating it per ray would not be more accurate. Twin: ``refe
 """
 
 import numpy as np
-import taichi as ti
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.weights.ray_model import Camera
 

@@ -15,10 +15,10 @@ then writes the lit part of the window as blocks and clears it. So no two thread
 import functools
 
 import numpy as np
-import taichi as ti
 from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.weights.microimages import LAYERS
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, Camera

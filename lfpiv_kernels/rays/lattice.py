@@ -1,7 +1,8 @@
 """The microlens lattice for the kernels: centres and cells of lenses, and Taichi functions that find a ray's lens."""
 
 import numpy as np
-import taichi as ti
+
+from lfpiv_kernels.libraries import ti
 
 Lattice = ti.types.vector(10, ti.f32)
 """Origin (s, t), basis vectors a (s, t) and b (s, t) [mm], and the rows of the inverse basis [1/mm]."""

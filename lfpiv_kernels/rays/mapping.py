@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
-import taichi as ti
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 
 BATCH = 8
 """Points that a CPU thread evaluates side by side, so that the compiler can use vector registers."""

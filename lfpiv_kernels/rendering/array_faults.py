@@ -7,7 +7,7 @@ c + g c^2, for each axis with its own g [1/mm]. A ray belongs to the lens whose 
 the position on the array. Rays must pass both.
 """
 
-import taichi as ti
+from lfpiv_kernels.libraries import ti
 
 Faults = ti.types.vector(3, ti.f32)
 """Drift g along s and t [1/mm], and shift of the second aperture on the pupil per distance on the array [mm/mm]."""

@@ -7,10 +7,10 @@ small sources.
 import math
 
 import numpy as np
-import taichi as ti
 from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.rendering import array_faults, real_optics
 from lfpiv_kernels.rendering.render import Matrix, Optics, RenderCamera

@@ -21,7 +21,8 @@ NumPy functions compute in float64 and are the reference. Taichi functions do th
 """
 
 import numpy as np
-import taichi as ti
+
+from lfpiv_kernels.libraries import ti
 
 NO_PLATE = np.array([[0.0, 0, 1, 0, 0, 0, 0]])
 """A window that does nothing."""

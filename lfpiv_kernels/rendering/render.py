@@ -10,11 +10,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import taichi as ti
 from scipy import stats
 from scipy.stats import qmc
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens, pack_lattice
 from lfpiv_kernels.rendering import array_faults, real_optics
 

@@ -1,9 +1,9 @@
 """Taichi: plenoptic images of bright patches of a plane, by rays traced backward from each pixel as in ``collect``."""
 
 import numpy as np
-import taichi as ti
 
 from lfpiv_kernels import runtime
+from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.rendering import array_faults, real_optics
 from lfpiv_kernels.rendering.collect import lens_reach, pixel_samples, ray_of_pixel, widest_spread

@@ -1,8 +1,7 @@
 """A voxel's ray model and a camera's geometry as the kernels of weights take them; see ``ray_model.h``."""
 
-import taichi as ti
-
 from lfpiv_kernels import native
+from lfpiv_kernels.libraries import ti
 
 ROW_GROUP: int = native.constant("projector.h", "ROW_GROUP")
 """Rows of a block of profiles are a multiple of it."""
