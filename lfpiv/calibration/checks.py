@@ -27,13 +27,12 @@ from lfpiv.lightfield.image_checks import (
     GAP_LIGHT,
     NO_PLACE,
     OTHER_APERTURE,
-    SATURATED,
     fingerprint,
     gap_light,
     microimage_px,
-    saturated_share,
     stated_px,
 )
+from lfpiv.lightfield.saturation import SATURATED, saturated_share
 from lfpiv.warn import SENTENCES, Code, Warning, warn
 
 log = logging.getLogger(__name__)
@@ -63,6 +62,8 @@ REJECTED = 0.5
 """Part of a plane's dots that is rejected above which a warning is due."""
 OFF_PITCHES = 1.0
 """Distance of a plane's dots from where they are stated to be above which a warning is due [microlens pitch]."""
+ROUNDING = 0.4
+"""Noise of the gaps up to which an image has none, apart from rounding [counts]."""
 FEWEST_PLANES = 2
 """Least number of planes. One plane does not determine the camera's depth."""
 
@@ -92,7 +93,8 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
         if difference > OTHER_APERTURE:
             raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {warning.sentence}")
         warn(log, replace(warning, subject=setup.name))
-    share = saturated_share(white)
+    noisy = decoder.background(white)[1] > ROUNDING  # without noise the middles of all microimages share one value
+    share = saturated_share(white, setup.white_level, piles=noisy)
     if share > SATURATED:
         warn(log, Warning(code=Code.WHITE_SATURATED, subject=setup.name, figures={"share": share}))
 
@@ -174,7 +176,7 @@ def check_light(
                 f"{paths[plane]}: board.images of camera {setup.name!r}: expected an image of its own, found the same "
                 f"image as {paths[other]}. Check what was copied."
             )
-        saturated[plane] = saturated_share(image)
+        saturated[plane] = saturated_share(image, setup.white_level)
     worst = int(saturated.argmax())
     if saturated[worst] > SATURATED:
         figures = {"share": float(saturated[worst]), "path": str(paths[worst])}

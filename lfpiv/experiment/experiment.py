@@ -40,6 +40,8 @@ class CameraSetup:
     """Path pattern of the background image, relative to the experiment file, or None."""
     raw: RawImages | None = None
     """Layout of the camera's files without a header, or None."""
+    white_level: float | None = None
+    """Value from which on pixels are saturated [counts]; None where the images show it."""
 
     def cells(self) -> tuple[str, ...]:
         """Return the camera's row in the card of its experiment."""

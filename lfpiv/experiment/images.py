@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from lfpiv.experiment.readers.table import Reader
 
 DTYPES = ("uint8", "uint16", "uint32", "int16", "int32", "float32", "float64")
+SCALED = 2.0
+"""Largest value of an image with fractions that was scaled."""
 FLIPS = {
     "none": (slice(None), slice(None)),
     "horizontal": (slice(None), slice(None, None, -1)),
@@ -97,17 +99,24 @@ def read_image(path: Path, label: str, *, flip: str = "none", raw: RawImages | N
 
 
 def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
-    """Refuse an image with the same value everywhere, such as an all-black one.
+    """Refuse an image with the same value everywhere, such as an all-black one, or with a scale from 0 to 1.
+
+    Noise and saturation are measured in counts, whose rounding hides what is in an image that was scaled.
 
     Raises
     ------
     InputError
-        If all pixels are equal.
+        If all pixels are equal, or values with fractions reach no further than `SCALED`.
     """
     low, high = float(image.min()), float(image.max())
     if high <= low or high <= 0:
         what = "is all black" if high <= 0 else f"holds the value {high:g} everywhere"
         raise InputError(f"{path} ({label}): expected an exposed image, found one that {what}. Take the image again.")
+    if max(high, -low) <= SCALED and (image != np.rint(image)).any():
+        raise InputError(
+            f"{path} ({label}): expected grey values in counts, found a scale of 0 to 1 (from {low:.3g} to {high:.3g}). "
+            "Save all images of this camera as it recorded them; or multiply all by its largest count, 4095 for 12 bits."
+        )
 
 
 @contextlib.contextmanager

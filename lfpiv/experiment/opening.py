@@ -289,6 +289,7 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
         background=table.background_image,
         raw=table.raw,
+        white_level=table.white_level,
     )
 
 

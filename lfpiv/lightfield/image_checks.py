@@ -17,6 +17,8 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE
+from lfpiv.lightfield.saturation import SATURATED, saturated_share
+from lfpiv.lightfield.saturation import saturated_pixels as saturated_pixels
 from lfpiv.warn import Code, Warning
 
 GAP_LIGHT = 0.1
@@ -27,8 +29,6 @@ APERTURE = 0.05
 """Relative difference of the microimages' diameter from the stated one above which a warning is due."""
 OTHER_APERTURE = 0.2
 """The same difference, above which the stated optics are certainly wrong."""
-SATURATED = 0.02
-"""Part of the bright pixels at the end of the sensor's range above which an image is saturated."""
 UNEVEN = 4.0
 """Ratio of the light in a part of the sensor between two frames of a pair above which a warning is due."""
 
@@ -37,7 +37,6 @@ _MEAN_REACH_PITCHES = 3.0  # half width of the local mean that is subtracted: am
 _CLIP_PERCENTILE = 99.9  # percentile at which pixels are clipped
 _SIGNIFICANT = 5.0  # least covariance [standard deviations of that of independent pixels]
 _LEAST_PIXELS = 500  # least number of pairs of pixels in the gaps, and inside the microimages
-_LEAST_SATURATED = 20  # least number of saturated pixels
 _TILE_PX = 1024  # side of the white image's middle part; further out other stops may cut the pupil
 _CORE_PITCHES = 0.15  # radius in which a microimage is evenly bright
 _LIT_LENS = 0.3  # least light of a lit lens, relative to the median
@@ -46,7 +45,8 @@ _RING_PX = 0.25  # width of the rings of a microimage's profile
 _CLEAR_PX, _CLEAR_WITHOUT_DARK_PX = 0.5, 2.0  # width of the gap beyond a microimage's edge
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
 _LIT_SHARE = 0.04  # least share of all light in a ninth of the sensor
-_RANGES = {(1 << bits) - 1 << shift for bits in range(8, 17) for shift in (0, 16 - bits)}  # right- and left-justified
+_FIELDS = 4  # side of the square of fields into which a ninth is divided
+_LOST_FIELDS = 3.0  # fields that lose their light, beyond their neighbours too: more than a particle that leaves
 
 
 def gap_light(image: np.ndarray, decoder: LightFieldDecoder) -> float:
@@ -144,43 +144,48 @@ def _covariance(image: np.ndarray, chosen: np.ndarray) -> float:
     return found if found > _SIGNIFICANT * float(a.std() * b.std()) / count**0.5 else 0.0
 
 
-def saturated_share(image: np.ndarray) -> float:
-    """Return the number of pixels at the largest value relative to those above half of it.
-
-    The result is 0 where the largest value is not the end of a range of 8 to 16 bits, right- or left-justified.
-    """
-    top = float(image.max())
-    if not (top.is_integer() and int(top) in _RANGES):
-        return 0.0
-    count = np.count_nonzero(image == top)
-    return count / np.count_nonzero(image > top / 2) if count >= _LEAST_SATURATED else 0.0
-
-
-def saturated_pixels(image: np.ndarray) -> np.ndarray:
-    """Return the pixels at the largest value, if it is the end of a range of 8 to 16 bits, bool."""
-    top = float(image.max())
-    at_end = top.is_integer() and int(top) in _RANGES
-    return image == top if at_end else np.zeros(image.shape, bool)
-
-
 def dark_blocks(first: np.ndarray, second: np.ndarray) -> int:
     """Count the parts of the sensor, of three by three, that are lit in one of two frames and hardly in the other.
+
+    Particles that cross the edge of a part are not counted: their light is in a neighbouring field of the other frame.
 
     Parameters
     ----------
     first, second : ndarray, shape (rows, columns)
         Frames of a camera [counts].
     """
-    light = []
-    for frame in (first, second):
-        above = np.maximum(frame - np.median(frame.ravel()[:: 1 + frame.size // _MEDIAN_SAMPLES]), 0)
-        light.append([block.sum() for band in np.array_split(above, 3, 0) for block in np.array_split(band, 3, 1)])
-    low, high = np.sort(light, axis=0)
-    return int(np.count_nonzero((high > _LIT_SHARE * high.sum()) & (high > UNEVEN * low)))
+    fields = np.array([_fields(frame) for frame in (first, second)])
+    light = _by_part(fields).sum(axis=-1)
+    lit = np.maximum(*light)
+    dark = 0
+    for bright, dim, own, other in zip(light, light[::-1], fields, fields[::-1], strict=True):
+        uneven = (bright > _LIT_SHARE * lit.sum()) & (bright > UNEVEN * dim)
+        lost = _by_part(np.where(own > UNEVEN * ndimage.maximum_filter(other, 3), own, 0))[uneven]
+        if lost.sum() ** 2 > _LOST_FIELDS * (lost**2).sum():
+            dark += int(np.count_nonzero(uneven))
+    return dark
+
+
+def _fields(frame: np.ndarray) -> np.ndarray:
+    """Return the light above the background in each of 12 by 12 fields of a sensor [counts]."""
+    above = np.maximum(frame - np.median(frame.ravel()[:: 1 + frame.size // _MEDIAN_SAMPLES]), 0)
+    bands = np.array([band.sum(axis=0, dtype=float) for band in np.array_split(above, 3 * _FIELDS)])
+    return np.array([field.sum(axis=1) for field in np.array_split(bands, 3 * _FIELDS, axis=1)]).T
+
+
+def _by_part(fields: np.ndarray) -> np.ndarray:
+    """Return the fields of each ninth of the sensor, shape (..., 9, fields)."""
+    parts = fields.reshape(*fields.shape[:-2], 3, _FIELDS, 3, _FIELDS).swapaxes(-3, -2)
+    return parts.reshape(*fields.shape[:-2], 9, _FIELDS**2)
 
 
 def image_warnings(
-    raw: np.ndarray, light: np.ndarray, decoder: LightFieldDecoder, camera: str, frame: str | None
+    raw: np.ndarray,
+    light: np.ndarray,
+    decoder: LightFieldDecoder,
+    camera: str,
+    frame: str | None,
+    white_level: float | None = None,
 ) -> list[Warning]:
     """Warn of misplaced or saturated light in one image.
 
@@ -194,12 +199,14 @@ def image_warnings(
         Name of the camera, for the warnings.
     frame : str, optional
         Name of the frame in its pair; None for an instant of a series.
+    white_level : float, optional
+        Value from which on pixels are saturated, where it is known [counts].
     """
     subject = _subject(camera, frame)
     found = []
     if (between := gap_light(light, decoder)) > GAP_LIGHT:
         found.append(Warning(code=Code.MISPLACED, subject=subject, figures={"gap_light": between}))
-    if (share := saturated_share(raw)) > SATURATED:
+    if (share := saturated_share(raw, white_level)) > SATURATED:
         found.append(Warning(code=Code.SATURATED, subject=subject, figures={"share": share}))
     return found
 

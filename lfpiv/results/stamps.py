@@ -101,6 +101,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
             "background": experiment.background,
             "background_image": recorded if images else None,
             "recorded": look_at(images, start),
+            "white_level": _white_levels(experiment),
             "images": look_at(seen, start) if None in recorded.values() else None,
         }
     )
@@ -249,7 +250,13 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None) 
         "particles": particles,
         "images": None,
         "background": background,
+        "white_level": _white_levels(experiment),
     }
+
+
+def _white_levels(experiment: Experiment) -> dict[str, float] | None:
+    """Return the stated white levels by camera; None if none is stated."""
+    return {camera.name: camera.white_level for camera in experiment.cameras if camera.white_level} or None
 
 
 def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:

@@ -21,8 +21,9 @@ from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
-from lfpiv.lightfield import background, decorrelation, image_checks
+from lfpiv.lightfield import background, decorrelation
 from lfpiv.lightfield.background import Series
+from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.lightfield.standing_light import StandingLight, nothing
 from lfpiv.progress import StepProgress
 from lfpiv.records import RecordError, read_object, validate
@@ -118,9 +119,10 @@ def estimate(
     for number, (name, camera) in enumerate(cameras.items()):
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
+            level = experiment.camera(name).white_level
             images = [experiment.background_image(name, frame) for frame in stamps.lit_frames(experiment)]
             found[name] = background.recorded_light(
-                [_without_dark(image, dark, camera) for image in images if image is not None], camera.decoder
+                [_without_dark(image, dark, camera, level) for image in images if image is not None], camera.decoder
             )
             log.info("background of %s: its background image", name)
         else:
@@ -208,7 +210,7 @@ def _light(
 ) -> np.ndarray | None:
     """Return the light of an image; None if it cannot be used."""
     try:
-        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera)[0]
+        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera, None)[0]
     except InputError:
         return None
 
@@ -240,7 +242,7 @@ def _read_series(
         for frame, image in zip(frames, images, strict=True):
             number = experiment.frames.index(frame.name)
             shift = None if experiment.series is None else 2 * (frame.number // apart)
-            light, noise, saturated = _without_dark(image, dark, camera)
+            light, noise, saturated = _without_dark(image, dark, camera, experiment.camera(camera.name).white_level)
             power = 1.0 if estimate is None else estimate.power(light, number)
             series[number].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
@@ -272,12 +274,12 @@ def _log_series(experiment: Experiment, name: str, light: StandingLight, count: 
 
 
 def _without_dark(
-    raw: np.ndarray, dark: np.ndarray | None, camera: CalibratedCamera
+    raw: np.ndarray, dark: np.ndarray | None, camera: CalibratedCamera, white_level: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Return the light of an image above its dark level, its noise, and its saturated pixels."""
     image = raw if dark is None else raw - dark
     level, noise = camera.decoder.background(image)
-    return image - np.float32(level), noise, image_checks.saturated_pixels(raw)
+    return image - np.float32(level), noise, saturated_pixels(raw, white_level)
 
 
 def content_hash(standing: Mapping[str, StandingLight]) -> str | None:

@@ -18,6 +18,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Frame
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
+from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.lightfield.standing_light import remains_warnings
 from lfpiv.warn import Warning
 
@@ -79,6 +80,7 @@ def frame_light(
     clipped = {}
     for name, camera in cameras.items():
         raw = experiment.particle_image(name, *frame) if read is None else read(name, frame)
+        top = experiment.camera(name).white_level
         dark = darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
@@ -86,11 +88,11 @@ def frame_light(
         if camera.standing is not None:
             light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame.name))
         images[name] = light
-        clipped[name] = image_checks.saturated_pixels(raw)
+        clipped[name] = saturated_pixels(raw, top)
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
-        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label)
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label, top)
     warnings += image_checks.signal_warnings(structure, label)
     if experiment.series is not None:
         warnings = [replace(warning, instants=(frame.number,)) for warning in warnings]

@@ -18,7 +18,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
-from lfpiv.lightfield.image_checks import saturated_share
+from lfpiv.lightfield.saturation import saturated_share
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.intensity_cap import PEAK_SIGMA, typical_peak
 from lfpiv.report.preview import Level, Preview, draw
@@ -179,6 +179,6 @@ def _level(
         noise=noise,
         peak=peak if np.isfinite(peak) else 0.0,
         lit=float((brightest > PEAK_SIGMA * noise).mean()),
-        saturated=saturated_share(recorded),
+        saturated=saturated_share(recorded, experiment.camera(name).white_level),
         structure=light.structure[name],
     )

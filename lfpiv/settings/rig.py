@@ -18,6 +18,7 @@ from lfpiv.settings.bounds import (
     Magnification,
     PathText,
     PixelPitch,
+    Positive,
 )
 from lfpiv.settings.table import Table
 
@@ -112,6 +113,9 @@ class CameraTable(NominalCamera):
     background_image: PathText | None = None
     """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
     series of image pairs shows what stands still."""
+    white_level: Positive | None = None
+    """Value from which on pixels are saturated, such as the white level in a camera's header [count]; absent: the
+    value at which the pixels of an image pile up."""
     raw: RawImages | None = None
     """Layout of the camera's files without a header; absent: it has none."""
 

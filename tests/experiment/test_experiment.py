@@ -244,6 +244,11 @@ BAD_IMAGES = {
         lambda path: tifffile.imwrite(path, np.full((48, 64), np.inf, np.float32)),
         ["finite"],
     ),
+    "scaled white": (
+        "white/left.tif",
+        lambda path: tifffile.imwrite(path, np.random.default_rng(0).random((48, 64), np.float32)),
+        ["counts", "0 to 1"],
+    ),
     "empty file": ("board/left/plane_00.tif", lambda path: path.write_bytes(b""), ["truncated", "empty"]),
     "no image": ("board/left/plane_00.tif", lambda path: path.write_text("text"), ["truncated or damaged"]),
 }

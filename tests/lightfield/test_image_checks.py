@@ -13,7 +13,7 @@ from support import scenes
 import lfpiv
 from lfpiv import statistics
 from lfpiv.lightfield import image_checks
-from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, SATURATED, dark_blocks, gap_light, saturated_share
+from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, dark_blocks, gap_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pair_vectors, pipeline
 from lfpiv.simulation.simulator import simulate
@@ -66,18 +66,6 @@ def test_light_between_the_microimages_shows_another_cameras_image(pair_of_camer
     assert gap_light(noise, left) == 0 == gap_light(np.zeros(left.gain.shape), left)
 
 
-@pytest.mark.parametrize("bits", [8, 12, 16])
-@pytest.mark.parametrize("justified", ["right", "left"])
-def test_saturation_is_found_at_the_end_of_a_range(bits, justified):
-    rng = np.random.default_rng(bits)
-    top = 2**bits - 1
-    step = 2 ** (16 - bits) if justified == "left" else 1
-    light = rng.exponential(0.2 * top, (300, 300))
-    assert saturated_share(np.minimum(light * 4, top).round() * step) > SATURATED
-    assert saturated_share((light * 0.9 * top / light.max()).round() * step) == 0
-    assert saturated_share(np.minimum(light, 0.7 * top)) == 0  # clipped, but not at the end of the range
-
-
 def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     experiment, _ = pair_of_cameras
     first, second = (experiment.particle_image("right", 0, frame) for frame in "ab")
@@ -85,6 +73,19 @@ def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     half = second.copy()
     half[200:] = np.median(half)
     assert dark_blocks(first, half) >= 2 and dark_blocks(half, first) == dark_blocks(first, half)
+
+
+def test_particles_that_leave_a_part_of_the_sensor_do_not_make_it_dark():
+    """Six particles: single ones carry the light of a part. Some cross its edge, one leaves the sensor."""
+    rows, columns = np.mgrid[:400, :400]
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        places = np.vstack([rng.uniform(0, 400, (4, 2)), [(130, 200), (5, 200)]])
+        first, second = (
+            sum(1000 * np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 2 / 6**2) for y, x in places + shift)
+            for shift in (0, (8, -25))
+        )
+        assert dark_blocks(first, second) == 0 == dark_blocks(second, first)
 
 
 def test_suspicious_images_are_found(pair_of_cameras):

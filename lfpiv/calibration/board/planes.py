@@ -9,6 +9,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.saturation import saturated_pixels
 
 HELD_BYTES = 16
 """Memory for the images of all planes, per pixel of the sensor [byte]."""
@@ -90,7 +91,7 @@ class Signals:
         level, sigma = self.levels[plane]
         signal = _without_dark(image, self.dark)
         signal -= np.float32(level)
-        top = image == image.max()
+        top = (image == image.max()) | saturated_pixels(image)
         if np.count_nonzero(top) >= _SATURATED_PIXELS and np.median(signal[top]) > _SATURATED_SIGMA * sigma:
             signal[top] = np.nan
         return signal
