@@ -114,8 +114,8 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
         raise InputError(f"{path} ({label}): expected an exposed image, found one that {what}. Take the image again.")
     if max(high, -low) <= SCALED and (image != np.rint(image)).any():
         raise InputError(
-            f"{path} ({label}): expected grey values in counts, found a scale of 0 to 1 (from {low:.3g} to {high:.3g}). "
-            "Save all images of this camera as it recorded them; or multiply all by its largest count, 4095 for 12 bits."
+            f"{path} ({label}): expected grey values in counts, found a scale of 0 to 1 ({low:.3g} to {high:.3g}). "
+            "Save all images of this camera as it recorded them; or multiply all by its full scale, 4095 for 12 bits."
         )
 
 
