@@ -101,6 +101,8 @@ class RawImages(Table):
     """Length of the file's header [byte]."""
     frame_header_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
     """Length of what stands before the pixels of each image [byte]."""
+    frame_footer_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
+    """Length of what stands behind the pixels of each image, such as a time stamp and filling [byte]."""
 
 
 class CameraTable(NominalCamera):

@@ -226,7 +226,7 @@ def test_hdf5_pixels_of_other_files_are_refused(tmp_path, frames):
         layout[:] = h5py.VirtualSource(tmp_path / "other.h5", "images", frames.shape)
         file.create_virtual_dataset("virtual", layout)
         file.create_dataset("sparse", (2, 100_000, 100_000), np.uint16, chunks=(1, 1000, 1000))
-        file.create_dataset("wide", (2, 30_000, 30_000), np.uint16, chunks=(1, 30_000, 30_000))
+        file.create_dataset("wide", (2, 20_000, 20_000), np.uint16, chunks=(1, 20_000, 20_000))
         file.create_dataset("empty", (2, ROWS, COLUMNS), np.uint16)
         file["compound"] = np.zeros((2, ROWS, COLUMNS), [("a", "u2"), ("b", "u2")])
         file["complex"] = np.zeros((2, ROWS, COLUMNS), complex)

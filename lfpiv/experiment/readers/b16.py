@@ -11,7 +11,7 @@ import struct
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.source import ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Frames
 
 _BASIC_BYTES = 24
@@ -31,7 +31,6 @@ class B16(Frames):
         if extended and start[_BASIC_BYTES:] not in (b"", bytes(4)):
             raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
         super().__init__(image.file, (rows, columns), np.dtype("<u2"), 1)
-        require_plausible(self.shape, 2, self.size)
 
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of the image's pixels."""

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lfpiv.experiment.readers.mraw import unpack_12
-from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Frames, read_bytes
 
 PACKED_10, PACKED_12 = 256, 1024
@@ -47,7 +47,6 @@ class Cine(Frames):
         self._top_down = rows < 0 or self._packing != 0
         super().__init__(image.file, (abs(rows), columns), np.dtype("u1" if bits == 8 else "<u2"), count)
         _require_grey(image, compression, bits, self._packing, setup_at)
-        require_plausible(self.shape, 2, self.size)
         self._offsets_at = offsets_at
         self._offset = struct.Struct("<q" if version else "<I")
         self._require_table()

@@ -14,7 +14,9 @@ import weakref
 import h5py
 import numpy as np
 
-from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage, require_plausible
+from lfpiv.experiment.readers.hdf5_chunks import all_written, read_chunks, require_filters, require_written
+from lfpiv.experiment.readers.limits import require_plausible
+from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage
 from lfpiv.experiment.readers.stack import OPEN_STACKS, OpenFiles
 
 MOST_LINKS = 16
@@ -127,27 +129,29 @@ _open_files: OpenFiles[Hdf5Images] = OpenFiles(OPEN_STACKS)
 def header(image: ImagePath) -> Header:
     """Return the header of an image without reading its pixels."""
     opened = _open_files.get(image, Hdf5Images)  # named, so that it stays open here
-    dataset, _ = opened.find(image.part)
-    return _checked(dataset)
+    return _checked(*opened.find(image.part))
 
 
 def in_order(image: ImagePath) -> bool:
-    """Return whether an image is one of a dataset of images, which are numbered from 0 without gaps."""
+    """Return whether an image is one of a dataset of images, all written: they are numbered from 0 without gaps."""
     opened = _open_files.get(image, Hdf5Images)
-    return opened.find(image.part)[1] is not None
+    dataset, number = opened.find(image.part)
+    return number is not None and (dataset.chunks is None or all_written(dataset))
 
 
 def read(image: ImagePath) -> np.ndarray:
     """Return the pixels of an image."""
     opened = _open_files.get(image, Hdf5Images)
     dataset, number = opened.find(image.part)
-    _checked(dataset)
+    _checked(dataset, number)
+    if dataset.chunks is not None:
+        return read_chunks(dataset, number)
     pixels: np.ndarray = dataset[()] if number is None else dataset[number]
     return pixels
 
 
-def _checked(dataset: h5py.Dataset) -> Header:
-    """Return the header of a dataset's images; refuse pixels in other files and sizes beyond what is stored."""
+def _checked(dataset: h5py.Dataset, number: int | None) -> Header:
+    """Return the header of an image; refuse pixels in other files, never written, or more than what is stored."""
     settings = dataset.id.get_create_plist()
     if dataset.is_virtual or settings.get_external_count():
         raise NotOneImage(f"a dataset {dataset.name} whose pixels are in another file; copy them into this one")
@@ -158,6 +162,8 @@ def _checked(dataset: h5py.Dataset) -> Header:
     require_plausible(shape, dataset.dtype.itemsize, stored)
     if dataset.chunks is not None:
         require_plausible(dataset.chunks, dataset.dtype.itemsize, stored)
+        require_filters(dataset)
+        require_written(dataset, number)
     if stored == 0:
         raise ValueError(f"the dataset {dataset.name} has no pixels")
     return Header((int(shape[0]), int(shape[1])), dataset.dtype.name)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Frames
 
 HEADER_BYTES = 1 << 20
@@ -20,8 +20,12 @@ _XML_KEYS = {
     "Image Height": "height",
     "Color Bit": "bit",
     "File Format": "fileFormat",
+    "Camera Type": "deviceName",
+    "Record Rate(fps)": "recordRate",
 }
 """Elements of the XML header by the keys of the text header."""
+_MODEL = re.compile(r"-([MC])(?![A-Za-z0-9])")
+"""Letter in the name of a camera's model that says monochrome or colour, as in "type 1100K-M-64GB"."""
 
 
 class Mraw(Frames):
@@ -33,12 +37,8 @@ class Mraw(Frames):
         )
         if (form := header.get("File Format", "mraw").lower()) != "mraw":
             raise NotOneImage(f"a recording saved as {form}; save it as MRAW")
-        if header.get("Color Type", "Mono").lower() != "mono" or self._bits not in (8, 12, 16):
-            raise NotOneImage(
-                f"{header.get('Color Type', 'Mono')} pixels of {self._bits} bits; expected 8, 12 or 16 bits"
-            )
+        _require_grey(header.get("Color Type", "Mono"), header.get("Camera Type", ""), self._bits)
         super().__init__(image.file, (rows, columns), np.dtype("u1" if self._bits == 8 else "<u2"), count)
-        require_plausible(self.shape, 2, self.size)
         if rows * columns * self._bits % 8:
             raise ValueError(f"{rows} x {columns} pixels of {self._bits} bits do not fill whole bytes")
         self._length = rows * columns * self._bits // 8
@@ -73,6 +73,21 @@ def unpack_12(data: bytes) -> np.ndarray:
     return np.stack([first << 4 | middle >> 4, (middle & 15) << 8 | last], axis=1).ravel()
 
 
+def _require_grey(colour: str, camera: str, bits: int) -> None:
+    """Refuse pixels behind a colour filter and odd bits. Both kinds of cameras write the colour type Raw."""
+    model = _MODEL.search(camera)
+    if bits not in (8, 12, 16):
+        raise NotOneImage(f"{colour[:20]} pixels of {bits} bits; save 8, 12 or 16 bits")
+    if colour.lower() == "mono" or (colour.lower() == "raw" and model is not None and model[1] == "M"):
+        return
+    if colour.lower() == "raw" and model is None:
+        raise NotOneImage(
+            f"pixels of the colour type Raw of a camera {camera[:60]!r}, whose name says neither M, monochrome, nor C, "
+            "colour; save the recording of a monochrome camera with the colour type Mono, such as with 16 bits"
+        )
+    raise NotOneImage(f"{colour[:20]} pixels of {bits} bits of a colour camera; record with a monochrome camera")
+
+
 def _beside(file: Path, suffix: str) -> Path | None:
     """Return the file of another suffix, in small or capital letters; None if there is no regular one."""
     return next((path for end in (suffix, suffix.upper()) if (path := file.with_suffix(end)).is_file()), None)
@@ -86,13 +101,16 @@ def _text_entries(text: str) -> dict[str, str]:
 
 def _xml_entries(text: str) -> dict[str, str]:
     """Return the entries of an XML header, which stands between other bytes, under the keys of the text header."""
-    found = {}
-    for key, name in _XML_KEYS.items():
-        if match := re.search(rf"<{name}>([^<]*)</{name}>", text):
-            found[key] = match[1].strip()
-    if match := re.search(r"<colorInfo>.*?<type>([^<]*)</type>.*?</colorInfo>", text, re.DOTALL):
-        found["Color Type"] = match[1].strip()
-    return found
+    found = {key: _element(text, name) for key, name in _XML_KEYS.items()}
+    found["Color Type"] = _element(_element(text, "colorInfo"), "type")
+    return {key: value for key, value in found.items() if value}
+
+
+def _element(text: str, name: str) -> str:
+    """Return what stands in the first element of a name; "" if there is none. Takes time in proportion to the text."""
+    inside = text.partition(f"<{name}>")[2]
+    content, end, _ = inside.partition(f"</{name}>")
+    return content.strip() if end else ""
 
 
 def _number(header: Mapping[str, str], key: str) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.limits import require_plausible
+from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Stack
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -9,7 +9,7 @@ from lfpiv.experiment.readers.stack import Frames
 
 
 class Raw(Frames):
-    """Images one after the other, after a header of known length and each after one of known length."""
+    """Images one after the other behind a header, each in a block with bytes of known number before and behind it."""
 
     def __init__(self, image: ImagePath):
         layout = image.raw
@@ -18,15 +18,18 @@ class Raw(Frames):
                 "expected the layout of a file without a header, found no table raw of its camera. State shape and "
                 "dtype in [camera.raw]."
             )
-        super().__init__(image.file, layout.shape, np.dtype(layout.dtype).newbyteorder(layout.byte_order), 0)
+        try:
+            super().__init__(image.file, layout.shape, np.dtype(layout.dtype).newbyteorder(layout.byte_order), 0)
+        except ValueError as error:
+            raise CannotRead(f"expected images as [camera.raw] states them, but {error}. Correct its shape.") from None
         self._start = layout.header_bytes + layout.frame_header_bytes
         self._length = layout.shape[0] * layout.shape[1] * self.dtype.itemsize
-        self._step = layout.frame_header_bytes + self._length
+        self._step = layout.frame_header_bytes + self._length + layout.frame_footer_bytes
         self._count, rest = divmod(self.size - layout.header_bytes, self._step)
         if rest or self._count < 1:
             raise CannotRead(
-                f"expected {layout.header_bytes} bytes and a multiple of {self._step} bytes, an image with its header, "
-                f"found {self.size} bytes. Correct [camera.raw], or copy the file again."
+                f"expected {layout.header_bytes} bytes and a multiple of {self._step} bytes, an image with its header "
+                f"and footer, found {self.size} bytes. Correct [camera.raw], or copy the file again."
             )
 
     def place(self, number: int) -> tuple[int, int]:

@@ -15,13 +15,6 @@ SUFFIXES = (
 )
 """Suffixes of image files."""
 
-LARGEST_IMAGE = 10**9
-"""Largest number of pixels of an image that is decoded [pixel]; no sensor has as many."""
-LARGEST_EXPANSION = 2000
-"""Largest size of pixels over that of their compressed form; deflate reaches 1032, LZW about 1400."""
-SMALL_IMAGE = 1 << 26
-"""Size of pixels that may be decoded from a compressed form of any size [byte]."""
-
 
 class NotOneImage(Exception):
     """The file holds something other than the one single-channel image asked for; the text names what it holds."""
@@ -92,29 +85,3 @@ def split(path: Path, raw: RawImages | None = None) -> ImagePath:
                 return ImagePath(Path(file), part, raw)
         at = text.find("#", at + 1)
     return ImagePath(path, "", raw)
-
-
-def require_plausible(shape: tuple[int, ...], item_bytes: int, stored_bytes: int) -> None:
-    """Refuse an image whose declared size its stored bytes cannot hold, before memory is allocated for it.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Declared shape [pixel].
-    item_bytes : int
-        Size of a pixel [byte].
-    stored_bytes : int
-        Size of its compressed form in the file [byte].
-
-    Raises
-    ------
-    ValueError
-        If it has more than `LARGEST_IMAGE` pixels, or expands by more than `LARGEST_EXPANSION`.
-    """
-    pixels = 1
-    for size in shape:
-        pixels *= int(size)
-    if pixels <= 0 or pixels > LARGEST_IMAGE:
-        raise ValueError(f"the header declares {' x '.join(str(size) for size in shape)} pixels")
-    if pixels * item_bytes > SMALL_IMAGE + LARGEST_EXPANSION * stored_bytes:
-        raise ValueError(f"{stored_bytes} stored bytes cannot hold the {pixels} pixels that the header declares")

@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from lfpiv.experiment.readers.limits import require_plausible
 from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage
 
 Opened = TypeVar("Opened")
@@ -102,6 +103,7 @@ class Frames(Stack):
         self.dtype = dtype
         self.size = os.stat(file).st_size
         self._count = count
+        require_plausible(shape, 1, self.size)
 
     @property
     def count(self) -> int:

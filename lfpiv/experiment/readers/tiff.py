@@ -13,11 +13,22 @@ import weakref
 import numpy as np
 import tifffile
 
-from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage, require_plausible
+from lfpiv.experiment.readers.limits import require_apart, require_plausible
+from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Stack, read_bytes
 
 MOST_TAGS = 4096
 """Largest number of entries of a page's directory; tifffile takes more for damage as well."""
+COMPRESSIONS = {
+    "NONE": 1,
+    "LZW": 5,
+    "deflate": 8,
+    "old deflate": 32946,
+    "PackBits": 32773,
+    "LZMA": 34925,
+    "Zstd": 50000,
+}
+"""Compressions without loss, whose decoders stop at the size that the directory declares."""
 STRIP_FILL = 4
 """Largest number of bytes that fill up a strip of pixels [byte]."""
 
@@ -115,20 +126,25 @@ class TiffStack(Stack):
 
     def _checked(self, page: tifffile.TiffPage, number: int) -> Header:
         """Return the header of a page; refuse one that is not one single-channel image with all its pixels."""
-        end = max(
-            (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0
-        )
         if len(page.shape) != 2 or page.samplesperpixel != 1:
-            raise NotOneImage(f"pixels of shape {page.shape}, such as a colour image; save raw grey values")
+            raise NotOneImage(
+                f"pixels of shape {page.shape} in one page, such as a colour image, or a stack that was saved as one "
+                "page; save each image as a page of raw grey values (tifffile: photometric='minisblack')"
+            )
         meaning = tifffile.PHOTOMETRIC(page.photometric)
         if meaning is not tifffile.PHOTOMETRIC.MINISBLACK:
             raise NotOneImage(f"{meaning.name} pixels; save raw grey values, 0 = black")
+        if page.compression not in COMPRESSIONS.values():
+            known = ", ".join(list(COMPRESSIONS)[1:])
+            raise NotOneImage(
+                f"pixels compressed by {tifffile.COMPRESSION(page.compression).name}; expected one of none, {known}"
+            )
         if page.dtype is None:
             raise ValueError("unknown pixel type")
         if number >= len(self._offsets):
-            end = sum(self._place_behind(page, number))
-        if end == 0 or end > self._size:
-            raise ValueError(f"pixel data end at byte {end}, the file at byte {self._size}")
+            require_apart([self._place_behind(page, number)], self._size)
+        else:
+            require_apart(zip(page.dataoffsets, page.databytecounts, strict=True), self._size)
         rows, columns = page.shape
         stored, strips = sum(page.databytecounts), len(page.databytecounts)
         require_plausible((rows, columns), page.dtype.itemsize, stored)
