@@ -21,7 +21,7 @@ from lfpiv.experiment.readers.source import NoSuchImage, NotOneImage
 SHUFFLE, FLETCHER, SZIP, BITSHUFFLE = 2, 3, 4, 32008
 OWN_FILTERS = (SHUFFLE, FLETCHER, SZIP, 5, 6)
 """Filters of HDF5 itself that cannot inflate, n-bit (5) and scale-offset (6) included; szip states its size."""
-DECODERS: dict[int, Callable[..., bytes]] = {
+DECODERS: dict[int, Callable[..., bytes | bytearray]] = {
     1: imagecodecs.zlib_decode,
     32000: imagecodecs.lzf_decode,
     32001: imagecodecs.blosc_decode,
@@ -44,7 +44,7 @@ def require_filters(dataset: h5py.Dataset) -> None:
 def all_written(dataset: h5py.Dataset) -> bool:
     """Return whether every chunk of a dataset was written."""
     grid = [math.ceil(size / edge) for size, edge in zip(dataset.shape, dataset.chunks, strict=True)]
-    return int(dataset.id.get_num_chunks()) >= math.prod(grid)
+    return bool(dataset.id.get_num_chunks() >= math.prod(grid))
 
 
 def require_written(dataset: h5py.Dataset, number: int | None) -> None:
@@ -100,7 +100,7 @@ def _undone(stored: bytes, number: int, values: tuple[int, ...], item_bytes: int
         return stored[:-4]
     if number == BITSHUFFLE:
         return _bits_in_order(stored, values, item_bytes, size)
-    return DECODERS[number](stored, out=size + 4)  # 4 bytes of a checksum that was added before
+    return bytes(DECODERS[number](stored, out=size + 4))  # 4 bytes of a checksum that was added before
 
 
 def _bytes_in_order(stored: bytes, item_bytes: int) -> bytes:
