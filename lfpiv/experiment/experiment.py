@@ -12,6 +12,7 @@ from pydantic import ConfigDict
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import images
+from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
@@ -97,10 +98,8 @@ class Experiment(Shown):
     compute: Compute
     particle_images: str
     """Path pattern of the particle images, relative to the experiment file."""
-    solid: np.ndarray | None = field(default=None, compare=False, repr=False)
-    """True for voxels without fluid, shape (z, y, x); None without a mask."""
-    mask_path: Path | None = field(default=None, compare=False)
-    """File of a mask, or None."""
+    mask: Mask | None = None
+    """Where the volume holds no fluid; None if it does everywhere."""
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
     """How many pairs are simulated to measure the damping by ghosts."""
     background: str = "none"
@@ -124,8 +123,11 @@ class Experiment(Shown):
             ("guard layers", guard_mm if isinstance(guard_mm, str) else f"{times(guard_mm)} mm (x, y, z)"),
             ("board", f"{times(board.dots)} dots, {board.spacing_mm:g} mm apart, {planes}"),
         ]
-        if self.solid is not None:
-            facts.append(("mask", f"{100 * float(self.solid.mean()):.1f} % of the volume holds no fluid"))
+        if self.mask is not None:
+            if self.mask.moves:
+                facts.append(("mask", f"a file of each frame: {self.mask.file}"))
+            else:
+                facts.append(("mask", f"{100 * float(self.mask.flags({}).mean()):.1f} % of the volume holds no fluid"))
         for name in ("smart", "correlation", "tracking", "network", "self_calibration", "bootstrap", "compute"):
             table = getattr(self, name)
             stated = {} if table is None else {key: getattr(table, key) for key in sorted(table.model_fields_set)}
@@ -152,6 +154,43 @@ class Experiment(Shown):
         if self.series is None:
             return Frame(pair, first), Frame(pair, second)
         return Frame(pair, first), Frame(pair + self.series.step, first)
+
+    def all_frames(self) -> Iterator[Frame]:
+        """Yield both frames of each pair."""
+        return (frame for pair in self.numbers for frame in self.pair_frames(pair))
+
+    def fields(self, frame: Frame) -> dict[str, Any]:
+        """Return the fields of path patterns of a frame."""
+        if self.series is not None:
+            return {"instant": frame.number}
+        number, name = frame
+        return {"pair": number, "frame": name, "image": 2 * number + self.frames.index(name)}
+
+    def solid(self, frame: Frame, grid: Grid | None = None) -> np.ndarray | None:
+        """Return the flags of the voxels without fluid in a frame, shape (z, y, x); None without a mask.
+
+        Parameters
+        ----------
+        frame : Frame
+        grid : Grid, optional
+            Grid of the flags, each of which is that of the nearest voxel; default: the voxels of the experiment.
+
+        Raises
+        ------
+        InputError
+            If the frame's file is no mask of this volume.
+        """
+        if self.mask is None:
+            return None
+        flags = self.mask.flags(self.fields(frame))
+        grid = self.grid if grid is None else grid
+        return flags if grid == self.mask.grid else np.ascontiguousarray(flags[grid.nearest_in(self.mask.grid)])
+
+    def mask_files(self, frames: Iterable[Frame]) -> list[Path]:
+        """Return the files of the masks of some frames, each once; none if no file is read."""
+        if self.mask is None or self.mask.file is None:
+            return []
+        return list(dict.fromkeys(self.mask.file_of(self.fields(frame)) for frame in frames))
 
     @property
     def in_sequence(self) -> bool:
@@ -227,11 +266,8 @@ class Experiment(Shown):
 
     def particle_path(self, name: str, pair: int, frame: str) -> Path:
         """Return the path of a particle image."""
-        if self.series is not None:
-            fields: dict[str, Any] = {"instant": self.instant(pair, frame)}
-        else:
-            fields = {"pair": pair, "frame": frame, "image": 2 * pair + self.frames.index(frame)}
-        return self.path.parent / self.particle_images.format(camera=name, **fields)
+        at = Frame(pair if self.series is None else self.instant(pair, frame), frame)
+        return self.path.parent / self.particle_images.format(camera=name, **self.fields(at))
 
     def particle_label(self, name: str, pair: int, frame: str) -> str:
         """Return key, camera and number of a particle image, for messages."""

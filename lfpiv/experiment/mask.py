@@ -1,21 +1,29 @@
-"""Voxels without fluid: from the file and the solids that an experiment names, sampled onto its grid.
+"""Voxels without fluid: from the files and the solids that an experiment names, sampled onto its grid.
 
 A voxel is masked if more than half of it is solid. Half-spaces and boxes are tested at the voxel's centre. A file is
-interpolated linearly between its points and averaged over the voxel.
+interpolated linearly between its points and averaged over the voxel. Of a body that moves there is a file of each
+frame. At the start these files are only looked at, and each is read when its frame is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import string
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import solid_shares
-from lfpiv.settings.volume import Box, ExperimentVolume, HalfSpace
+from lfpiv.settings.volume import Box, HalfSpace, Solid
 
 VARIABLE = "mask"
 """Name of the mask in a file with several variables."""
@@ -25,39 +33,94 @@ MOST_SAMPLES = 16
 """Largest number of samples along an edge of a voxel, for files with far smaller spacing."""
 
 
-def solid_voxels(path: Path, volume: ExperimentVolume, grid: Grid) -> np.ndarray | None:
-    """Return the flags of the voxels without fluid, shape (z, y, x); None if the volume has no mask.
+@dataclass(frozen=True, kw_only=True)
+class Mask:
+    """Where the volume of an experiment holds no fluid, in all frames or in each."""
 
-    Parameters
-    ----------
-    path : Path
-        The experiment file, from which the path of the mask starts.
-    volume : ExperimentVolume
-        Its table ``[volume]``.
-    grid : Grid
-        The voxels.
+    path: Path
+    """The experiment file, from which the paths of masks start."""
+    grid: Grid
+    """Voxels of the experiment."""
+    file: str | None
+    """Path of a NetCDF file, or its pattern; None without one."""
+    solid: tuple[Solid, ...]
+    """Solids that stand still."""
 
-    Raises
-    ------
-    InputError
-        If a file is no mask, a mask or a solid does not meet the volume, or no fluid is left.
-    """
-    if volume.mask is None and not volume.solid:
-        return None
-    solid = np.zeros(grid.shape, bool)
-    if volume.mask is not None:
-        solid |= read_mask(path.parent / volume.mask, grid)
-    for number, one in enumerate(volume.solid):
-        inside = _inside(one, grid)
-        if not inside.any():
-            raise InputError(
-                f"{path}: volume.solid[{number}]: expected a {one.kind} that reaches into the volume, found none of "
-                "its voxels inside. Check its lengths [mm], or leave it out."
-            )
-        solid |= inside
-    if solid.all():
-        raise InputError(f"{path}: volume: expected some fluid in the volume, found only solid. {_INVERTED}")
-    return solid
+    @property
+    def moves(self) -> bool:
+        """Whether frames have masks of their own."""
+        return self.file is not None and any(
+            field is not None for _, field, _, _ in string.Formatter().parse(self.file)
+        )
+
+    def file_of(self, fields: Mapping[str, Any]) -> Path:
+        """Return the file of the frame with these fields of path patterns."""
+        assert self.file is not None
+        return self.path.parent / self.file.format(**fields)
+
+    def flags(self, fields: Mapping[str, Any]) -> np.ndarray:
+        """Return the flags of the voxels without fluid in a frame, shape (z, y, x).
+
+        Raises
+        ------
+        InputError
+            If a file is no mask, a mask or a solid does not meet the volume, or no fluid is left.
+        """
+        return self._read(fields) if self.moves else self._still
+
+    def look_at(self, frames: Iterable[Mapping[str, Any]]) -> None:
+        """Refuse a file of a frame that is missing, damaged, or of another form than the first one, which is read.
+
+        Parameters
+        ----------
+        frames : iterable of mappings
+            Fields of path patterns of each frame.
+
+        Raises
+        ------
+        InputError
+            As `flags`. The values of the other files are checked when they are read.
+        """
+        frames = iter(frames)
+        first = next(frames)
+        self.flags(first)
+        if not self.moves:
+            return
+        start = self.file_of(first)
+        known, seen = _layout(start), {start}
+        for path in map(self.file_of, frames):
+            if path not in seen:
+                _require(path)
+                if (found := _layout(path)) != known:
+                    raise InputError(f"{path}: expected the variables and shapes of {start}, {known}, found {found}.")
+                seen.add(path)
+
+    @cached_property
+    def _still(self) -> np.ndarray:
+        return self._read({})
+
+    @cached_property
+    def _walls(self) -> np.ndarray:
+        """Flags of the voxels in `solid`."""
+        walls = np.zeros(self.grid.shape, bool)
+        for number, one in enumerate(self.solid):
+            inside = _inside(one, self.grid)
+            if not inside.any():
+                raise InputError(
+                    f"{self.path}: volume.solid[{number}]: expected a {one.kind} that reaches into the volume, found "
+                    "none of its voxels inside. Check its lengths [mm], or leave it out."
+                )
+            walls |= inside
+        return walls
+
+    def _read(self, fields: Mapping[str, Any]) -> np.ndarray:
+        solid, source = self._walls, f"{self.path}: volume"
+        if self.file is not None:
+            file = self.file_of(fields)
+            solid, source = solid | read_mask(file, self.grid, may_miss=self.moves), f"{file}"
+        if solid.all():
+            raise InputError(f"{source}: expected some fluid in the volume, found only solid. {_INVERTED}")
+        return solid
 
 
 _INVERTED = "True, and the side from which a half-space's normal points away, are solid: is a mask inverted?"
@@ -72,11 +135,12 @@ def _inside(solid: HalfSpace | Box, grid: Grid) -> np.ndarray:
     return inside
 
 
-def read_mask(path: Path, grid: Grid) -> np.ndarray:
+def read_mask(path: Path, grid: Grid, *, may_miss: bool = False) -> np.ndarray:
     """Read a mask from a NetCDF file and sample it onto a grid: true for voxels that are more than half solid.
 
     The file has one variable, or one named ``mask``, over z, y, x with coordinates [mm], evenly spaced or not: true, or
-    1, where there is solid; false, or 0, where there is fluid. Beyond the file's points there is fluid.
+    1, where there is solid; false, or 0, where there is fluid. Beyond the file's points there is fluid. A body that
+    moves `may_miss` the volume in some frames.
 
     Raises
     ------
@@ -98,7 +162,7 @@ def read_mask(path: Path, grid: Grid) -> np.ndarray:
             )
         values = np.moveaxis(np.tensordot(_sampling(nodes, voxels, grid.voxel_mm), values, (1, number)), 0, number)
     solid: np.ndarray = values > 0.5
-    if not solid.any():
+    if not (may_miss or solid.any()):
         raise InputError(
             f"{path}: expected some solid (true) in the volume, found only fluid there. Check the mask's coordinates "
             "[mm], or leave volume.mask out."
@@ -108,19 +172,12 @@ def read_mask(path: Path, grid: Grid) -> np.ndarray:
 
 def _load(path: Path) -> xr.DataArray:
     """Return the mask in a file, its coordinates rising."""
-    try:
-        if not path.is_file():
-            raise InputError(f"{path}: expected the NetCDF file of volume.mask, found no such file. Check the path.")
-        with xr.open_dataset(path) as opened:
-            points = sum(variable.size for variable in opened.variables.values())
-            if points > MOST_POINTS:
-                raise InputError(f"{path}: expected at most {MOST_POINTS:.0e} points, found {points:.1e}.")
-            stored = opened.load()
-    except InputError:
-        raise
-    except Exception as error:  # readers raise exceptions of many types on damaged files
-        reason = " ".join(str(error).split())[:100]
-        raise InputError(f"{path}: expected a NetCDF file, found one that cannot be read ({reason}).") from None
+    _require(path)
+    with _reading(path), xr.open_dataset(path) as opened:
+        points = sum(variable.size for variable in opened.variables.values())
+        if points > MOST_POINTS:
+            raise InputError(f"{path}: expected at most {MOST_POINTS:.0e} points, found {points:.1e}.")
+        stored = opened.load()
     names = [str(name) for name in stored.data_vars]
     if VARIABLE not in names and len(names) != 1:
         found = ", ".join(names) or "none"
@@ -140,6 +197,33 @@ def _load(path: Path) -> xr.DataArray:
                 f"{np.array2string(nodes, threshold=6, edgeitems=2)}."
             )
     return mask.transpose(*AXES).sortby(list(AXES))
+
+
+def _layout(path: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each variable in a file without reading values, some 40 times as fast as by `_load`."""
+    with _reading(path):
+        if not h5py.is_hdf5(path):
+            with xr.open_dataset(path) as opened:
+                return {str(name): values.shape for name, values in opened.variables.items()}
+        with h5py.File(path) as file:
+            return {str(name): values.shape for name, values in file.items() if isinstance(values, h5py.Dataset)}
+
+
+def _require(path: Path) -> None:
+    if not path.is_file():
+        raise InputError(f"{path}: expected the NetCDF file of volume.mask, found no such file. Check the path.")
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Name a file that cannot be read in the error."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # readers raise exceptions of many types on damaged files
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(f"{path}: expected a NetCDF file, found one that cannot be read ({reason}).") from None
 
 
 def _half_step(nodes: np.ndarray, end: int) -> float:

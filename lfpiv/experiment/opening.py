@@ -6,14 +6,13 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import images, nominal_checks, recorded, scale_checks
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
-from lfpiv.experiment.mask import solid_voxels
+from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.patterns import check_length, check_pattern
 from lfpiv.experiment.toml import parse, read_text, read_toml
 from lfpiv.geometry.grid import AXES, Grid
@@ -93,14 +92,16 @@ def read_experiment(path: str | Path) -> Experiment:
         compute=table.compute,
         particle_images=particles.images,
         background=particles.background,
+        mask=_mask(path, table.volume, grid),
     )
     for camera in experiment.cameras:
         if camera.orientation is not None:
             nominal_checks.require_board(path, experiment.board, camera.name, camera.optics, camera.orientation)
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
-    mask_path = None if table.volume.mask is None else path.parent / table.volume.mask
-    return replace(experiment, solid=solid_voxels(path, table.volume, grid), mask_path=mask_path)
+    if experiment.mask is not None:
+        experiment.mask.look_at(map(experiment.fields, experiment.all_frames()))
+    return experiment
 
 
 def check_tables(path: Path, table: ExperimentTable) -> None:
@@ -120,7 +121,9 @@ def check_tables(path: Path, table: ExperimentTable) -> None:
             _require_orientation(path, one)
     board, particles = table.board, table.particles
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
-    _check_particle_pattern(path, particles, names)
+    check_pattern(path, "particles.images", particles.images, {"camera": names, **_fields(particles, particles.images)})
+    if table.volume.mask is not None:
+        check_pattern(path, "volume.mask", table.volume.mask, _fields(particles, table.volume.mask), optional=True)
     for one in table.camera:
         if one.background_image is not None:
             _check_background(path, one, particles)
@@ -137,6 +140,12 @@ def grid_of(path: Path, table: ExperimentTable) -> Grid:
     grid = _grid(path, table.volume, len(table.camera))
     _check_windows(path, table.correlation, grid)
     return grid
+
+
+def _mask(path: Path, volume: ExperimentVolume, grid: Grid) -> Mask | None:
+    if volume.mask is None and not volume.solid:
+        return None
+    return Mask(path=path, grid=grid, file=volume.mask, solid=volume.solid)
 
 
 def _read_table(path: Path) -> ExperimentTable:
@@ -185,15 +194,13 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
             yield pair, str(error)
 
 
-def _check_particle_pattern(path: Path, particles: Particles, cameras: Sequence[str]) -> None:
-    fields: dict[str, Sequence[Any]] = {"camera": cameras}
+def _fields(particles: Particles, pattern: str) -> dict[str, Sequence[Any]]:
+    """Return the fields that tell the frames apart in a path pattern, with their values."""
     if (series := particles.series) is not None:
-        fields["instant"] = series.numbers
-    elif "{image" in particles.images:
-        fields["image"] = range(2 * particles.count)
-    else:
-        fields |= {"pair": range(particles.count), "frame": particles.frames}
-    check_pattern(path, "particles.images", particles.images, fields)
+        return {"instant": series.numbers}
+    if "{image" in pattern:
+        return {"image": range(2 * particles.count)}
+    return {"pair": range(particles.count), "frame": particles.frames}
 
 
 def _require_orientation(path: Path, camera: CameraTable) -> None:

@@ -28,8 +28,8 @@ LONGEST_PATH_BYTES = 4095
 """Longest path that file systems take, folder included [byte]."""
 
 
-def check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any]) -> None:
-    """Refuse a path pattern with unknown fields, or with one path for several images."""
+def check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any], *, optional: bool = False) -> None:
+    """Refuse a path pattern with unknown fields, or with one path for several images unless fields are `optional`."""
     known, shown = ", ".join("{" + name + "}" for name in fields), _shortened(repr(pattern))
     try:
         parts = [part for part in string.Formatter().parse(pattern) if part[1] is not None]
@@ -46,7 +46,7 @@ def check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any])
             found = _shortened(f"{name}{'!' + conversion if conversion else ''}{':' + width if width else ''}")
             raise InputError(f"{path}: {key}: expected {allowed}, found {{{found}}}.")
     for name, values in fields.items():
-        if len(values) > 1 and name not in used:
+        if len(values) > 1 and name not in used and not optional:
             raise InputError(
                 f"{path}: {key}: expected {{{name}}} in the path, since there are {len(values)}, found {shown}."
             )

@@ -87,7 +87,7 @@ def checked_mask(mask: xr.DataArray | np.ndarray, axes_mm: Sequence[np.ndarray],
         for axis, centres in zip(AXES, axes_mm, strict=True):
             if axis in mask.coords and np.abs(np.asarray(mask[axis], float) - centres).max() > POSITION_TOLERANCE_MM:
                 raise ValueError(f"{name}: expected the coordinates {axis} of the volume [mm], got others.")
-    solid = solid_shares(values, name) >= 0.5
+    solid: np.ndarray = values if values.dtype == bool else solid_shares(values, name) >= 0.5
     if solid.all():
         raise ValueError(f"{name}: expected some voxels of fluid (false), got none. Is the mask inverted?")
     return solid

@@ -220,7 +220,7 @@ def _volume(run: Run, calibration: Calibration, assumptions: list[str]) -> Volum
         assumptions.append(f'particles are points: voxels are refined by {LARGEST:g}, the most that "auto" chooses')
     if experiment.guard_mm == "auto" and run.guard is None:
         assumptions.append("no light lies beyond the volume: one guard layer on each side")
-    if experiment.solid is not None:
+    if experiment.mask is not None:
         assumptions.append("the whole volume holds fluid: the mask saves some time")
     if experiment.tracking is not None:
         assumptions.append("the time of [tracking] is not in the plan")

@@ -112,7 +112,7 @@ class Volume:
         )
         z, y, x = first
         part = Grid(shape=shape, voxel_mm=grid.voxel_mm, first_centre_mm=(z, y, x))
-        return replace(self, experiment=replace(self.experiment, grid=part, solid=None))
+        return replace(self, experiment=replace(self.experiment, grid=part, mask=None))
 
     def part(self, voxels: int) -> Volume:
         """Return a part of about a number of reconstructed voxels: a slab of slices around the middle.

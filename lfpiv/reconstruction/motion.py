@@ -26,18 +26,17 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.geometry.volume import MASKED
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import DEFAULTS, SmartSettings, require_whole
 from lfpiv.reconstruction.shared_light import MotionField, shared_guesses
-from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.reconstruction.solver import SmartSolver, Volume
 from lfpiv.settings.processing import Correlation
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.settings import CorrelationSettings
 from lfpiv.velocity.systematic import unexplained, with_systematic
-from lfpiv.velocity.volume_pair import missing_smoothing, preprocess
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess, solid_voxels, voxel_axes
 from lfpiv.velocity.windows import Windows
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.correlation.correlate import correlate_windows
@@ -100,8 +99,6 @@ class PairSolver:
         How often the motion is measured and followed, >= 0.
     correlation : mapping, optional
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
-    mask : ndarray or DataArray, shape (z, y, x), optional
-        Voxels without fluid, as of `reconstruct`.
 
     Raises
     ------
@@ -116,10 +113,9 @@ class PairSolver:
         *,
         motion_passes: int = DEFAULTS.motion_passes,
         correlation: Mapping[str, Any] | None = None,
-        mask: np.ndarray | xr.DataArray | None = None,
     ):
         require_whole("motion_passes", motion_passes)
-        self.smart = SmartSolver(weights, settings, mask)
+        self.smart = SmartSolver(weights, settings)
         self.motion_passes = motion_passes
         self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
 
@@ -128,8 +124,10 @@ class PairSolver:
         images: Sequence[Mapping[str, np.ndarray]],
         floors: Sequence[float | Mapping[str, float] | None] = (None, None),
         progress: Callable[[float], None] | None = None,
+        *,
+        masks: Sequence[Volume | None] = (None, None),
     ) -> PairResult:
-        """Reconstruct both frames of a pair; arguments as of `reconstruct_pair`.
+        """Reconstruct both frames of a pair; arguments as of `reconstruct_pair`, `masks` of the frames in order.
 
         Raises
         ------
@@ -138,6 +136,8 @@ class PairSolver:
         """
         if len(images) != 2 or len(floors) != 2:
             raise ValueError(f"images, floor: expected two frames, got {len(images)} and {len(floors)}.")
+        if len(masks) != 2:
+            raise ValueError(f"mask: expected one, or one of each frame, got {len(masks)}.")
         iterations = self.smart.settings.iterations
         restart = math.ceil(ITERATION_SHARE * iterations)
         total, done = 2.0 * (iterations + self.motion_passes * restart), 0.0
@@ -149,7 +149,14 @@ class PairSolver:
                 if progress is not None and total > 0:
                     progress((done + fraction * count) / total)
 
-            found = self.smart.solve(images[number], floor=floors[number], iterations=count, first=first, progress=step)
+            found = self.smart.solve(
+                images[number],
+                floor=floors[number],
+                mask=masks[number],
+                iterations=count,
+                first=first,
+                progress=step,
+            )
             done += count
             return found
 
@@ -189,7 +196,7 @@ def reconstruct_pair(
     floor: Sequence[float | Mapping[str, float] | None] = (None, None),
     correlation: Mapping[str, Any] | None = None,
     iterations: int = DEFAULTS.iterations,
-    mask: np.ndarray | xr.DataArray | None = None,
+    mask: Volume | Sequence[Volume] | None = None,
     progress: Callable[[float], None] | None = None,
     **smart: Any,
 ) -> list[xr.DataArray]:
@@ -213,8 +220,8 @@ def reconstruct_pair(
         Settings of `correlate`, which measures the motion; default: those of an experiment without such a table.
     iterations : int
         SMART iterations of the first reconstruction; a pass takes at most `ITERATION_SHARE` of them.
-    mask : ndarray or DataArray, shape (z, y, x), optional
-        Voxels without fluid, as of `reconstruct`.
+    mask : ndarray or DataArray, shape (z, y, x), or a tuple or list of two, optional
+        Voxels without fluid, as of `reconstruct`; of a body that moves those of each frame.
     progress : callable, optional
         Called with the finished fraction.
     **smart
@@ -238,8 +245,9 @@ def reconstruct_pair(
     if "first" in smart:
         raise ValueError("first: expected no first guess, as each pass makes its own; use `reconstruct` for one.")
     settings = SmartSettings(iterations=iterations, **smart)
-    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation, mask=mask)
-    return solver.solve(images, floor, progress).to_dataarrays()
+    solver = PairSolver(weights, settings, motion_passes=motion_passes, correlation=correlation)
+    masks = mask if isinstance(mask, (tuple, list)) else (mask, mask)
+    return solver.solve(images, floor, progress, masks=masks).to_dataarrays()
 
 
 def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr.Dataset:
@@ -291,7 +299,8 @@ def unshared_quality(vectors: xr.Dataset, volumes: Sequence[xr.DataArray]) -> xr
         preprocess((light - np.median(light)).astype(np.float32), missing, settings.intensity_power)
         for light in unshared
     )
-    solid = volumes[0].coords[MASKED].values if MASKED in volumes[0].coords else None
+    axes = voxel_axes(volumes[0], volumes[1], None)
+    solid = solid_voxels(None, volumes[0], volumes[1], axes)
     (first, second), _ = UndeformedPair((first, second), solid).deformed(motion.midway, window)
     step = tuple(round(at[1] - at[0]) if len(at) > 1 else n for at, n in zip(motion.nodes, first.shape, strict=True))
     windows = Windows.covering(first.shape, window, step)

@@ -159,6 +159,7 @@ class SequenceSolver:
         before: Before | None,
         *,
         floor: float | Mapping[str, float] | None = None,
+        mask: np.ndarray | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Solved:
         """Reconstruct an instant from its images and the one before; arguments as of `SmartSolver.solve`.
@@ -173,7 +174,7 @@ class SequenceSolver:
         given_up = before is not None and before.given_up
         known = None if given_up else before
         prepared, (flow, vectors) = runtime.side_by_side(
-            lambda: self.smart.prepare(images, floor=floor), lambda: self._flow(known)
+            lambda: self.smart.prepare(images, floor=floor, mask=mask), lambda: self._flow(known)
         )
 
         def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:

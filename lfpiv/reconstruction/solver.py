@@ -27,6 +27,8 @@ FEW_CAMERAS = 2
 LEAST_ALONE = 0.8
 """Least share of a camera's pixels that see one set of rays only."""
 
+Volume = np.ndarray | xr.DataArray
+
 
 class SmartSolver:
     """SMART with fixed weights and settings.
@@ -37,28 +39,19 @@ class SmartSolver:
         The operator.
     settings : SmartSettings
         Settings of every reconstruction.
-    mask : ndarray or DataArray, shape (z, y, x), optional
-        Voxels without fluid, as of `lfpiv.reconstruct`.
-
-    Raises
-    ------
-    ValueError
-        If the mask does not fit the volume.
     """
 
-    def __init__(self, weights: Weights, settings: SmartSettings, mask: np.ndarray | xr.DataArray | None = None):
+    def __init__(self, weights: Weights, settings: SmartSettings):
         self.weights = weights
         self.settings = settings
-        grid = weights.grid
-        self.solid = None if mask is None else checked_mask(mask, grid.axes_mm)
-        """True for voxels without fluid, shape (z, y, x); None without a mask."""
-        self._last: tuple[tuple[object, ...], Normalisation] | None = None
+        self._last: tuple[tuple[object, ...], np.ndarray | None, Normalisation] | None = None
 
     def solve(
         self,
         images: Mapping[str, np.ndarray],
         *,
         floor: float | Mapping[str, float] | None = None,
+        mask: Volume | None = None,
         iterations: int | None = None,
         first: np.ndarray | None = None,
         progress: Callable[[float], None] | None = None,
@@ -67,18 +60,23 @@ class SmartSolver:
 
         `iterations` replaces that of the settings.
         """
-        prepared = self.prepare(images, floor=floor)
+        prepared = self.prepare(images, floor=floor, mask=mask)
         return prepared.solve(iterations=iterations, first=first, progress=progress)
 
     def prepare(
-        self, images: Mapping[str, np.ndarray], *, floor: float | Mapping[str, float] | None = None
+        self,
+        images: Mapping[str, np.ndarray],
+        *,
+        floor: float | Mapping[str, float] | None = None,
+        mask: Volume | None = None,
     ) -> PreparedInstant:
         """Measure what SMART needs to know of the images of one instant; arguments and exceptions as of `solve`."""
         images = checked_images(self.weights, images)
+        solid = None if mask is None else checked_mask(mask, self.weights.grid.axes_mm)
         sieve, cap = self._sieve_and_cap(images)
         share = self.settings.floor_share
         recordings = record(self.weights, images, floor=floor, floor_share=share, intensity_cap=cap)
-        normalisation = self._normalisation({name: one.camera_gain for name, one in recordings.items()}, sieve)
+        normalisation = self._normalisation({name: one.camera_gain for name, one in recordings.items()}, sieve, solid)
         equations = ImageEquations(
             [
                 CameraEquation(
@@ -96,18 +94,18 @@ class SmartSolver:
             recordings=recordings,
             normalisation=normalisation,
             intensity_cap=cap,
-            solid=self.solid,
+            solid=solid,
             views=self._views,
             equations=equations,
         )
 
-    def _normalisation(self, camera_gains: dict[str, float], sieve: Sieve) -> Normalisation:
-        """Return what all instants with these brightnesses and this sieve share; that of the last ones is kept."""
+    def _normalisation(self, camera_gains: dict[str, float], sieve: Sieve, solid: np.ndarray | None) -> Normalisation:
+        """Return what all instants with these brightnesses, sieve and mask share; that of the last ones is kept."""
         key = (*camera_gains.values(), sieve)
-        if self._last is None or self._last[0] != key:
-            made = Normalisation(self.weights, self.settings, self.subsets, self.solid, camera_gains, sieve)
-            self._last = key, made
-        return self._last[1]
+        if self._last is None or self._last[0] != key or not _same(self._last[1], solid):
+            made = Normalisation(self.weights, self.settings, self.subsets, solid, camera_gains, sieve)
+            self._last = key, solid, made
+        return self._last[2]
 
     @cached_property
     def subsets(self) -> tuple[Subset, ...]:
@@ -172,3 +170,7 @@ class SmartSolver:
             return None
         views = self.weights.views
         return views if views.min() < 2 else None
+
+
+def _same(one: np.ndarray | None, other: np.ndarray | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))

@@ -142,5 +142,5 @@ def reconstruct(
         tolerance=tolerance,
         subsets=subsets,
     )
-    solver = SmartSolver(weights, settings, mask)
-    return solver.solve(images, floor=floor, first=first, progress=progress).to_dataarray()
+    solver = SmartSolver(weights, settings)
+    return solver.solve(images, floor=floor, mask=mask, first=first, progress=progress).to_dataarray()

@@ -25,9 +25,10 @@ from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
 
-IMAGES, IMAGES_BESIDE = "images", "images_beside"
-"""Parts of a stamp: the images of a result, and those of the instants beside it on which it depends."""
-OF_PAIR = (IMAGES, IMAGES_BESIDE)
+IMAGES, IMAGES_BESIDE, MASK_FILES = "images", "images_beside", "mask_files"
+"""Parts of a stamp: the images of a result, and those of the instants beside it on which it depends. Where frames have
+masks of their own, also the masks of all these."""
+OF_PAIR = (IMAGES, IMAGES_BESIDE, MASK_FILES)
 """Parts of a stamp that differ from pair to pair of a run."""
 
 

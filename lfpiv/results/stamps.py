@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +15,11 @@ import numpy as np
 
 from lfpiv import files
 from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
-from lfpiv.experiment.readers.source import split
+from lfpiv.experiment.readers.source import ImagePath, split
 from lfpiv.experiment.segments import depended_on
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.results.image_identity import CondensedImages, Images, content_hash, look_at
-from lfpiv.results.provenance import IMAGES_BESIDE, OF_PAIR, Stamp
+from lfpiv.results.provenance import IMAGES_BESIDE, MASK_FILES, OF_PAIR, Stamp
 from lfpiv.version import __version__
 
 
@@ -165,7 +165,8 @@ def of_pair(
         "guard": guard if guard != NO_LAYERS else None,
         "refinement": refinement if refinement != 1 else None,
     }
-    of_pair = parts | {"images": look_at(experiment.pair_images(pair), start)}
+    both_frames = experiment.pair_frames(pair)
+    of_pair = parts | {"images": look_at(experiment.pair_images(pair), start)} | _mask_files(experiment, both_frames)
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.series is None:
         volumes = Stamp(of_pair)
@@ -175,17 +176,21 @@ def of_pair(
             particles=_of_particles(experiment, of_pair | of_vectors),
         )
     first, second = (
-        Stamp(parts | {"images": look_at(experiment.frame_images(instant), start)})
-        for instant in experiment.pair_frames(pair)
+        Stamp(parts | {"images": look_at(experiment.frame_images(instant), start)} | _mask_files(experiment, [instant]))
+        for instant in both_frames
     )
     of_vectors["step"] = experiment.series.step
     if experiment.in_sequence:
-        beside = [_images_beside(experiment, instant.number) for instant in experiment.pair_frames(pair)]
+        others = [_frames_beside(experiment, instant.number) for instant in both_frames]
+        beside = [look_at(_images(experiment, frames), start, condensed=True) for frames in others]
+        masks = [_mask_files(experiment, [one, *more]) for one, more in zip(both_frames, others, strict=True)]
         first, second = (
-            Stamp({**stamp.parts, IMAGES_BESIDE: images}) for stamp, images in zip((first, second), beside, strict=True)
+            Stamp({**stamp.parts, IMAGES_BESIDE: images, **of_masks})
+            for stamp, images, of_masks in zip((first, second), beside, masks, strict=True)
         )
         both = [state for images in beside if images is not None for state in images.states]
         of_vectors[IMAGES_BESIDE] = None if None in beside else CondensedImages(tuple(both))
+        of_vectors |= _mask_files(experiment, [*both_frames, *others[0], *others[1]])
     return PairStamps(
         volumes=(first, second),
         vectors=Stamp(of_pair | of_vectors),
@@ -199,10 +204,11 @@ def of_bootstrap(experiment: Experiment, vectors: Stamp, pairs: Sequence[int]) -
     It has the parts of `vectors`, the stamp of a pair's vectors, so that readers can compare the two; but the images
     are those of the pairs.
     """
-    sources = [image for pair in pairs for image in experiment.pair_images(pair)]
+    frames = [frame for pair in pairs for frame in experiment.pair_frames(pair)]
     parts = {name: part for name, part in vectors.parts.items() if name not in OF_PAIR}
-    images = look_at(sources, experiment.path.parent)
-    return Stamp(parts | {"images": images, "bootstrap": experiment.simulated_pairs})
+    images = look_at(_images(experiment, frames), experiment.path.parent)
+    parts |= {"images": images, "bootstrap": experiment.simulated_pairs}
+    return Stamp(parts | _mask_files(experiment, frames))
 
 
 def of_tracks(experiment: Experiment, particles: Stamp, pairs: Sequence[int]) -> Stamp:
@@ -210,11 +216,10 @@ def of_tracks(experiment: Experiment, particles: Stamp, pairs: Sequence[int]) ->
 
     It has the parts of `particles`, the stamp of a pair's particles; but the images are those of all the pairs.
     """
-    frames = dict.fromkeys(frame for pair in pairs for frame in experiment.pair_frames(pair))
-    sources = [image for frame in frames for image in experiment.frame_images(frame)]
+    frames = list(dict.fromkeys(frame for pair in pairs for frame in experiment.pair_frames(pair)))
     parts = {name: part for name, part in particles.parts.items() if name not in OF_PAIR}
-    images = look_at(sources, experiment.path.parent, condensed=True)
-    return Stamp(parts | {"images": images, "tracks": list(pairs)})
+    images = look_at(_images(experiment, frames), experiment.path.parent, condensed=True)
+    return Stamp(parts | {"images": images, "tracks": list(pairs)} | _mask_files(experiment, frames))
 
 
 def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp | None:
@@ -223,13 +228,23 @@ def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp |
     return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
-def _images_beside(experiment: Experiment, instant: int) -> Images | None:
-    """Return the images of other instants on which one of a sequence depends; None if one is missing."""
+def _frames_beside(experiment: Experiment, instant: int) -> list[Frame]:
+    """Return the other instants on which one of a sequence depends."""
     assert experiment.series is not None
-    name = experiment.frames[0]
-    frames = (Frame(number, name) for number in depended_on(experiment.series, instant))
-    sources = [image for frame in frames for image in experiment.frame_images(frame)]
-    return look_at(sources, experiment.path.parent, condensed=True)
+    return [Frame(number, experiment.frames[0]) for number in depended_on(experiment.series, instant)]
+
+
+def _images(experiment: Experiment, frames: Iterable[Frame]) -> list[ImagePath]:
+    """Return the images of some frames."""
+    return [image for frame in frames for image in experiment.frame_images(frame)]
+
+
+def _mask_files(experiment: Experiment, frames: Iterable[Frame]) -> dict[str, Images | None]:
+    """Return the part of a stamp that states the masks of some frames; empty if they are the same in all frames."""
+    if experiment.mask is None or not experiment.mask.moves:
+        return {}
+    found = map(split, experiment.mask_files(frames))
+    return {MASK_FILES: look_at(found, experiment.path.parent, condensed=experiment.in_sequence)}
 
 
 def _of_light(experiment: Experiment, calibration: str, background: str | None) -> dict[str, Any]:
@@ -243,7 +258,7 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None) 
         "calibration": calibration,
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
-        "mask": _mask_hash(experiment.solid),
+        "mask": _mask(experiment),
         "smart": experiment.smart.model_dump(),
         "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
@@ -269,6 +284,15 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
     return {**experiment.self_calibration.model_dump(), "images": content}
 
 
-def _mask_hash(solid: np.ndarray | None) -> str | None:
-    """Hash the flags of the voxels without fluid; None without a mask."""
-    return None if solid is None else hashlib.blake2b(np.packbits(solid).tobytes(), digest_size=16).hexdigest()
+def _mask(experiment: Experiment) -> Any:
+    """Hash the flags of the voxels without fluid; None without a mask.
+
+    Where frames have masks of their own, return the solids that stand still and the pattern of the files.
+    """
+    mask = experiment.mask
+    if mask is None:
+        return None
+    if mask.moves:
+        return {"file": mask.file, "solid": [one.model_dump() for one in mask.solid]}
+    solid = mask.flags({})
+    return hashlib.blake2b(np.packbits(solid).tobytes(), digest_size=16).hexdigest()

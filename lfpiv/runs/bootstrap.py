@@ -120,14 +120,16 @@ def _measure(work: PairWork, pairs: list[int], progress: StepProgress) -> Dampin
     for pair in evenly_spread(pairs, IMITATED):
         frames += [work.light_again(frame) for frame in work.experiment.pair_frames(pair)]
     noise = {name: sum(frame.noise[name] for frame in frames) / len(frames) for name in frames[0].noise}
-    first = work.reconstructor.solver.smart.solve(frames[0].images, floor=frames[0].noise)
+    start = frames[0]  # simulated particles are where its volume has light, so they are measured with its mask
+    mask = work.reconstructor.solid(start.frame)
+    first = work.reconstructor.solver.smart.solve(start.images, floor=start.noise, mask=mask)
     # simulated particles are alike, so that their images would choose another limit
     as_recorded = work.reconstructor.with_intensity_cap(first.intensity_cap)
     return measure_damping(
         work.weights,
         vectors,
         [frame.images for frame in frames],
-        partial(work.measure, reconstructor=as_recorded),
+        partial(work.measure, frames=(start.frame, start.frame), reconstructor=as_recorded),
         pairs=work.experiment.simulated_pairs,
         noise=noise,
         volume=first.volume,

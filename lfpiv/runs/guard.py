@@ -87,9 +87,8 @@ def layers(experiment: Experiment, guard: Guard | None) -> Layers:
 
 
 def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
-    """Return the experiment with the padded grid, on which solids go on as they are at the faces."""
-    solid = None if experiment.solid is None else np.pad(experiment.solid, guard, mode="edge")
-    return replace(experiment, grid=experiment.grid.padded(guard), solid=solid)
+    """Return the experiment with the padded grid."""
+    return replace(experiment, grid=experiment.grid.padded(guard))
 
 
 def decide(

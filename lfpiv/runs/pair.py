@@ -311,18 +311,20 @@ class PairWork:
         self,
         images: Sequence[Mapping[str, np.ndarray]],
         noise: Sequence[Mapping[str, float]],
-        reconstructor: Reconstructor | None = None,
+        *,
+        frames: Sequence[Frame],
+        reconstructor: Reconstructor,
     ) -> xr.Dataset:
-        """Return the vectors of the images of two frames, measured as those of the experiment; nothing is written.
+        """Return the vectors of two sets of images, measured as those of the experiment; nothing is written.
 
-        `reconstructor` replaces that of the pairs.
+        The masks are those of `frames`.
 
         Raises
         ------
         ValueError
             If the images cannot be reconstructed.
         """
-        first, second = (reconstructor or self.reconstructor).volumes(images, noise)
+        first, second = reconstructor.volumes(images, noise, frames)
         return measure_vectors(first, second, self.experiment)
 
     def vectors_between(self, pair: int, volumes: PairVolumes) -> xr.Dataset:

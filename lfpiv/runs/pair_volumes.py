@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
@@ -27,8 +27,6 @@ from lfpiv.reconstruction.sequence import Before, SequenceSolver, Solved, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.runs.guard import with_guard
-from lfpiv.runs.refinement import refined
 from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
 from lfpiv.velocity.settings import FIRST_SEARCH
 from lfpiv.warn import Code, Warning
@@ -83,8 +81,17 @@ class Reconstructor:
             SmartSettings(**smart.of_one_frame(self.refinement)),
             motion_passes=smart.motion_passes,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
-            mask=refined(with_guard(self.experiment, self.guard), self.refinement).solid,
         )
+
+    def solid(self, frame: Frame) -> np.ndarray | None:
+        """Return the flags of the reconstructed voxels without fluid in a frame, shape (z, y, x); None without a mask.
+
+        Raises
+        ------
+        InputError
+            If the frame's mask cannot be used.
+        """
+        return self.experiment.solid(frame, self.weights.grid)
 
     def with_intensity_cap(self, cap: float) -> Reconstructor:
         """Return the same reconstruction whose limit of the counts does not depend on the images."""
@@ -111,7 +118,9 @@ class Reconstructor:
         start = time.perf_counter()
         solver = self.solver
         try:
-            result = solver.solve([frame.images for frame in light], [frame.noise for frame in light], progress)
+            masks = [self.solid(frame.frame) for frame in light]
+            floors = [frame.noise for frame in light]
+            result = solver.solve([frame.images for frame in light], floors, progress, masks=masks)
         except ValueError as error:
             raise InputError(f"pair {pair}: {error}") from error
         if solver.motion_passes:
@@ -125,7 +134,8 @@ class Reconstructor:
         """Reconstruct one instant of a series from its images alone; raise as `pair`."""
         number, start = light.frame.number, time.perf_counter()
         try:
-            found = self.solver.smart.solve(light.images, floor=light.noise, progress=progress)
+            mask = self.solid(light.frame)
+            found = self.solver.smart.solve(light.images, floor=light.noise, mask=mask, progress=progress)
         except ValueError as error:
             raise InputError(f"instant {number}: {error}") from error
         seconds = time.perf_counter() - start
@@ -142,7 +152,8 @@ class Reconstructor:
         """
         number, start = light.frame.number, time.perf_counter()
         try:
-            solved = self.sequence.solve(light.images, before, floor=light.noise, progress=progress)
+            mask = self.solid(light.frame)
+            solved = self.sequence.solve(light.images, before, floor=light.noise, mask=mask, progress=progress)
         except ValueError as error:
             raise InputError(f"instant {number}: {error}") from error
         if solved.start is Start.MISSED:
@@ -166,21 +177,22 @@ class Reconstructor:
         return self._frame(found.to_dataarray(), own.light, seconds)
 
     def volumes(
-        self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]]
+        self, images: Sequence[Mapping[str, np.ndarray]], noise: Sequence[Mapping[str, float]], frames: Sequence[Frame]
     ) -> tuple[xr.DataArray, xr.DataArray]:
-        """Return the volumes of the images of two frames, reconstructed as those of the experiment.
+        """Return the volumes of two sets of images, reconstructed as some frames of the experiment, with their masks.
 
         Raises
         ------
         ValueError
             If the images cannot be reconstructed.
         """
+        masks = [self.solid(frame) for frame in frames]
         if self.experiment.series is None:
-            first, second = self.solver.solve(images, noise).to_dataarrays()
+            first, second = self.solver.solve(images, noise, masks=masks).to_dataarrays()
         else:
             first, second = (
-                self.solver.smart.solve(frame, floor=floor).to_dataarray()
-                for frame, floor in zip(images, noise, strict=True)
+                self.solver.smart.solve(one, floor=floor, mask=mask).to_dataarray()
+                for one, floor, mask in zip(images, noise, masks, strict=True)
             )
         return _as_written(first, self.experiment.grid), _as_written(second, self.experiment.grid)
 

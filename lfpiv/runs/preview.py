@@ -113,7 +113,9 @@ def _reconstruct(
     current.progress("coarse volumes", 0.0)
     work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0)
     try:
-        volumes = work.volumes([frame.images for frame in light], [frame.noise for frame in light])
+        volumes = work.volumes(
+            [frame.images for frame in light], [frame.noise for frame in light], [frame.frame for frame in light]
+        )
     except ValueError as error:
         raise InputError(f"{coarse.name_of(current.numbers[0])}: {error}") from error
     current.progress("coarse volumes", 1.0)
@@ -128,11 +130,10 @@ def coarsened(experiment: Experiment) -> Experiment:
     x, y, z = (n * grid.voxel_mm for n in reversed(grid.shape))
     cx, cy, cz = grid.centre_mm.tolist()
     coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(max(x, edge), max(y, edge), max(z, edge)), voxel_mm=edge)
-    solid = None if experiment.solid is None else np.ascontiguousarray(experiment.solid[coarse.nearest_in(grid)])
     # particles are smaller than these voxels: their size, measured for the sieve and the limit, would say nothing
     measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if getattr(experiment.smart, key) == "auto"}
     smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "motion_passes": 0, **measured})
-    return replace(experiment, grid=coarse, solid=solid, smart=smart)
+    return replace(experiment, grid=coarse, smart=smart)
 
 
 def _form(cameras: Mapping[str, CalibratedCamera]) -> str:

@@ -13,8 +13,6 @@ import time
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from lfpiv.geometry.grid import Layers
 from lfpiv.reconstruction.refinement import LARGEST, STEP, measure_size, needed_refinement
 from lfpiv.records import RecordError, validate
@@ -79,12 +77,8 @@ def factor(experiment: Experiment, found: Refinement | None) -> float:
 
 
 def refined(experiment: Experiment, factor: float) -> Experiment:
-    """Return the experiment with smaller voxels; one is solid where the voxel around its centre is."""
-    grid = experiment.grid.refined(factor)
-    solid = (
-        None if experiment.solid is None else np.ascontiguousarray(experiment.solid[grid.nearest_in(experiment.grid)])
-    )
-    return replace(experiment, grid=grid, solid=solid)
+    """Return the experiment with smaller voxels."""
+    return replace(experiment, grid=experiment.grid.refined(factor))
 
 
 def decide(

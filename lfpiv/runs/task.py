@@ -1,7 +1,7 @@
 """The task of a run for its workers: data in a folder that only this user can write, never code.
 
-The task is a JSON file in a folder; weights and mask are arrays beside it. The name of the folder holds the digest of
-the task, and the task those of the arrays. The run sends this name to its workers, so a worker refuses what somebody
+The task is a JSON file in a folder; weights are arrays beside it. The name of the folder holds the digest of the task,
+and the task that of the arrays. The run sends this name to its workers, so a worker refuses what somebody
 has changed.
 """
 
@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import PydanticSerializationError
 
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.weights.operator import Weights
 
-TASK, INSTANTS, WEIGHTS, SOLID = "task.json", "instants", "weights", "solid.npy"
-"""Names of the task and of the volumes in its folder, and of the arrays beside that folder."""
+TASK, INSTANTS, WEIGHTS = "task.json", "instants", "weights"
+"""Names of the task and of the volumes in its folder, and of the weights beside that folder."""
 
 DIGEST_CHARACTERS = 32
 """Characters of the task's digest in the name of its folder."""
@@ -47,9 +46,6 @@ class Task(BaseModel):
 
     version: str
     experiment: Experiment
-    """Without its mask, which is a file."""
-    solid: str | None
-    """Digest of the mask; None without one."""
     folder: Folder
     calibration_hash: str
     guard: Layers
@@ -64,18 +60,9 @@ class Task(BaseModel):
     """CPU threads of each worker; None for as many as its cluster grants."""
 
     def work(self, shared: Path) -> PairWork:
-        """Return the work on each pair, without weights and images, of a task that was read from a folder.
-
-        Raises
-        ------
-        InputError
-            If the mask is not the one of the task.
-        """
-        experiment = self.experiment
-        if self.solid is not None:
-            experiment = dataclasses.replace(experiment, solid=_read_solid(shared.parent / SOLID, self.solid))
+        """Return the work on each pair, without weights and images, of a task that was read from a folder."""
         return PairWork(
-            experiment=experiment,
+            experiment=self.experiment,
             folder=self.folder,
             calibration_hash=self.calibration_hash,
             guard=self.guard,
@@ -86,12 +73,12 @@ class Task(BaseModel):
             keep_volumes=self.keep_volumes,
             background=self.background,
             vectors=self.vectors,
-            scratch=None if experiment.series is None else shared / INSTANTS,
+            scratch=None if self.experiment.series is None else shared / INSTANTS,
         )
 
 
 def write_task(work: PairWork, device: str, threads: int | None) -> Path:
-    """Write the task, the weights and the mask into the run's folder; return the folder.
+    """Write the task and the weights into the run's folder; return the folder.
 
     Raises
     ------
@@ -108,14 +95,10 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
         _make_private(root)
         base.mkdir(mode=0o700)
         _require_space(base, 0 if work.weights is None else work.weights.memory_bytes)
-    experiment, solid = _absolute(work.experiment), work.experiment.solid
-    with writing(base / SOLID):
-        if solid is not None:
-            np.save(base / SOLID, solid, allow_pickle=False)
+    experiment = _absolute(work.experiment)
     task = Task(
         version=__version__,
-        experiment=dataclasses.replace(experiment, solid=None),
-        solid=None if solid is None else _digest((base / SOLID).read_bytes()),
+        experiment=experiment,
         folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
         calibration_hash=work.calibration_hash,
         guard=work.guard,
@@ -194,16 +177,6 @@ def _require_space(folder: Path, need: int) -> None:
         )
 
 
-def _read_solid(path: Path, digest: str) -> np.ndarray:
-    try:
-        if _digest(path.read_bytes()) != digest:
-            raise ValueError("its content was changed")
-        solid: np.ndarray = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected the mask of this run, found none that fits ({error}).") from None
-    return solid
-
-
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:DIGEST_CHARACTERS]
 
@@ -218,4 +191,6 @@ def _absolute(experiment: Experiment) -> Experiment:
         )
         for camera in experiment.cameras
     )
-    return dataclasses.replace(experiment, path=experiment.path.absolute(), cameras=cameras)
+    path, mask = experiment.path.absolute(), experiment.mask
+    mask = None if mask is None else dataclasses.replace(mask, path=path)
+    return dataclasses.replace(experiment, path=path, cameras=cameras, mask=mask)

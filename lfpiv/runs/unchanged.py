@@ -168,8 +168,7 @@ def program() -> str:
 def _read_files(experiment: Experiment) -> Iterator[Path]:
     """Yield the files that a run of an experiment reads, some of them more than once."""
     yield experiment.path
-    if experiment.mask_path is not None:
-        yield experiment.mask_path
+    yield from experiment.mask_files(experiment.all_frames())
     yield from (image.file for image in experiment.calibration_images())
     for camera in experiment.cameras:
         backgrounds = (experiment.background_path(camera.name, frame) for frame in experiment.frames)

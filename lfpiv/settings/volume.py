@@ -65,6 +65,8 @@ class ExperimentVolume(Volume):
     """Table ``[volume]`` of an experiment: the voxel grid, and where it holds no fluid."""
 
     mask: PathText | None = None
-    """Path of a NetCDF file, true or 1 where there is solid, over z, y, x with coordinates in mm; absent: none."""
+    """Path of a NetCDF file, true or 1 where there is solid, over z, y, x with coordinates in mm; absent: none. With
+    ``{pair}`` and perhaps ``{frame}``, or ``{image}``, or in a time series ``{instant}``, a file of each frame, for a
+    body that moves."""
     solid: Annotated[tuple[Solid, ...], Field(max_length=bounds.MOST_SOLIDS)] = ()
     """Solids in the volume, each a table."""

@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Frame
 from lfpiv.experiment.mask import read_mask
-from lfpiv.experiment.opening import open_experiment
+from lfpiv.experiment.opening import open_experiment, read_experiment
 from lfpiv.geometry.grid import Grid
 
 GRID = Grid.from_extent(centre_mm=(0.0, 0.0, 0.1), size_mm=(0.8, 0.6, 0.4), voxel_mm=0.05)  # of `tiny_experiment`
@@ -41,7 +42,7 @@ def stored(path, values_of, step_mm, *, reach=0.6, dtype=bool, order=("z", "y", 
 
 
 def test_without_a_mask_all_is_fluid(tiny_experiment):
-    assert open_experiment(tiny_experiment).solid is None
+    assert open_experiment(tiny_experiment).mask is None
 
 
 @pytest.mark.parametrize("step_mm", [0.01, 0.05, 0.08])
@@ -77,7 +78,7 @@ normal = [-2.0, -1.0, 0.0]
 kind = "box"
 centre_mm = [-0.3, 0.0, 0.1]
 size_mm = [0.2, 0.21, 0.11]"""
-    solid = open_experiment(add(tiny_experiment, text)).solid
+    solid = open_experiment(add(tiny_experiment, text)).solid(Frame(0, "a"))
     x, y, z = np.moveaxis(places(), -1, 0)
     behind = 2 * (x - 0.21) + y > 0
     inside = (np.abs(x + 0.3) <= 0.1) & (np.abs(y) <= 0.105) & (np.abs(z - 0.1) <= 0.055)
@@ -88,7 +89,7 @@ size_mm = [0.2, 0.21, 0.11]"""
 def test_a_file_and_solids_add_up(tiny_experiment):
     stored(tiny_experiment.parent / "mask.nc", ball, 0.03)
     box = '[[volume.solid]]\nkind = "box"\ncentre_mm = [0.4, 0.3, 0.3]\nsize_mm = [0.2, 0.2, 0.2]'
-    solid = open_experiment(add(tiny_experiment, f'mask = "mask.nc"\n{box}')).solid
+    solid = open_experiment(add(tiny_experiment, f'mask = "mask.nc"\n{box}')).solid(Frame(1, "b"))
     alone = read_mask(tiny_experiment.parent / "mask.nc", GRID)
     assert solid[alone].all() and solid[-1, -1, -1] and solid.sum() == alone.sum() + 8
 
@@ -150,3 +151,104 @@ def test_a_file_that_is_no_netcdf_is_named(tmp_path):
     (tmp_path / "mask.nc").write_text("no mask")
     with pytest.raises(InputError, match="expected a NetCDF file"):
         read_mask(tmp_path / "mask.nc", GRID)
+
+
+def moving(path, x_mm, *, reach=0.6):
+    """Write the mask of a box whose centre is at `x_mm`."""
+    path.parent.mkdir(exist_ok=True)
+    body = lambda points: (np.abs(points - np.array([x_mm, 0.0, 0.1])) < 0.12).all(-1)  # noqa: E731
+    return stored(path, body, 0.03, reach=reach)
+
+
+@pytest.fixture
+def body(tiny_experiment):
+    """An experiment of two pairs and a mask of each frame; in the last frame the body has left the volume."""
+    for number, x_mm in enumerate((-0.2, -0.1, 0.1, 0.9)):
+        moving(tiny_experiment.parent / "mask" / f"{number // 2}{'ab'[number % 2]}.nc", x_mm)
+    return add(tiny_experiment, 'mask = "mask/{pair}{frame}.nc"')
+
+
+def test_each_frame_has_its_own_mask(body):
+    experiment = open_experiment(body)
+    found = {frame: experiment.solid(frame) for frame in experiment.all_frames()}
+    for frame, solid in found.items():
+        file = body.parent / "mask" / f"{frame.number}{frame.name}.nc"
+        np.testing.assert_array_equal(solid, read_mask(file, GRID, may_miss=True))
+        assert experiment.mask_files([frame]) == [file]
+    assert [bool(solid.any()) for solid in found.values()] == [True, True, True, False]
+    assert "a file of each frame" in str(experiment)
+
+
+@pytest.mark.parametrize("pattern", ["mask/{pair:03d}.nc", "mask/{image:03d}.nc", "mask/{frame}.nc"])
+def test_frames_may_share_a_mask(tiny_experiment, pattern):
+    fields = [{"pair": n // 2, "frame": "ab"[n % 2], "image": n} for n in range(4)]
+    for number, name in enumerate(dict.fromkeys(pattern.format(**one) for one in fields)):
+        moving(tiny_experiment.parent / name, 0.05 * number)
+    experiment = open_experiment(add(tiny_experiment, f'mask = "{pattern}"'))
+    names = [
+        path.relative_to(tiny_experiment.parent).as_posix() for path in experiment.mask_files(experiment.all_frames())
+    ]
+    assert names == list(dict.fromkeys(pattern.format(**one) for one in fields))
+
+
+def test_an_instant_has_one_mask_in_both_its_pairs(tiny_experiment):
+    text = tiny_experiment.read_text().replace("{pair:04d}{frame}", "{instant}").replace("pairs = 2", "instants = 4")
+    tiny_experiment.write_text(text)
+    for number in range(4):
+        moving(tiny_experiment.parent / "mask" / f"{number:05d}.nc", 0.05 * number)
+    experiment = read_experiment(add(tiny_experiment, 'mask = "mask/{instant:05d}.nc"'))
+    assert len(experiment.mask_files(experiment.all_frames())) == 4
+    assert experiment.mask_files(experiment.pair_frames(1)[1:]) == experiment.mask_files(experiment.pair_frames(2)[:1])
+
+
+def cut_short(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def thinner(path):
+    moving(path, 0.0, reach=0.5)
+
+
+def flat(path):
+    mask = xr.load_dataarray(path)
+    path.unlink()
+    mask.isel(z=20, drop=True).to_netcdf(path, engine="h5netcdf")
+
+
+BAD_FRAMES = {
+    "missing": (lambda path: path.unlink(), "no such file"),
+    "empty": (lambda path: path.write_bytes(b""), "cannot be read"),
+    "cut short": (cut_short, "cannot be read"),
+    "another shape": (thinner, "expected the variables and shapes"),
+    "two dimensions": (flat, "expected the variables and shapes"),
+    "text": (lambda path: path.write_text("no mask"), "expected a NetCDF file"),
+}
+
+
+@pytest.mark.parametrize("bad", BAD_FRAMES)
+def test_the_mask_of_one_frame_is_refused_by_name_before_any_work(body, bad):
+    damage, words = BAD_FRAMES[bad]
+    file = body.parent / "mask" / "1b.nc"
+    damage(file)
+    with pytest.raises(InputError) as error:
+        read_experiment(body)
+    assert str(error.value).startswith(f"{file}: ") and words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "pattern", ["mask/{instant}.nc", "mask/{camera}{pair}.nc", "mask/{pair!r}.nc", "mask/{pair.nc"]
+)
+def test_a_pattern_that_no_frame_has_is_refused(tiny_experiment, pattern):
+    with pytest.raises(InputError, match=r"volume\.mask: expected "):
+        read_experiment(add(tiny_experiment, f'mask = "{pattern}"'))
+
+
+def test_values_of_a_frame_are_checked_when_they_are_read(body):
+    file = body.parent / "mask" / "1b.nc"
+    mask = xr.load_dataarray(file)
+    file.unlink()
+    (mask.astype(np.uint8) * 255 + 255).to_netcdf(file, engine="h5netcdf")
+    experiment = read_experiment(body)
+    with pytest.raises(InputError, match=r"1b\.nc: .*from 0 to 1"):
+        experiment.solid(Frame(1, "b"))

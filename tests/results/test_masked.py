@@ -8,7 +8,7 @@ import xarray as xr
 from support.vector_sets import random_vectors
 
 import lfpiv
-from lfpiv.experiment.opening import open_experiment
+from lfpiv.experiment.opening import open_experiment, read_experiment
 from lfpiv.quantities import scale_of
 from lfpiv.report import flow, slice_panels
 from lfpiv.report import vectors as report
@@ -105,3 +105,40 @@ def test_another_mask_makes_another_volume(tiny_experiment):
         found.append(stamps.of_pair(open_experiment(tiny_experiment), "", 0))
     assert len({stamp.volumes[0].hash for stamp in found}) == 3
     assert "mask" in found[1].volumes[0].changes(provenance.Marks(**found[2].volumes[0].attributes))
+
+
+@pytest.mark.parametrize(
+    ("kind", "changed"),
+    [("pairs", [5]), ("series", [4, 5]), ("predicted series", [*range(1, 11)])],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_changed_mask_of_a_frame_concerns_its_pairs_only(tiny_experiment, kind, changed):
+    """A predicted instant depends on those before it, and on the three after it that correct it."""
+    text = tiny_experiment.read_text()
+    pattern = "{pair}" if kind == "pairs" else "{instant}"
+    numbers = "pairs = 12" if kind == "pairs" else "instants = 12"
+    if kind != "pairs":
+        text = text.replace("{pair:04d}{frame}", "{instant}")
+    text = text.replace("pairs = 2", numbers).replace("voxel_mm = 0.05\n", f'voxel_mm = 0.05\nmask = "{pattern}.nc"\n')
+    tiny_experiment.write_text(f"{text}\n[smart]\npredict = {str(kind.startswith('predicted')).lower()}\n")
+    axes = {axis: np.arange(-0.5, 0.5, 0.1) for axis in DIMS}
+    body = xr.DataArray(np.zeros((10, 10, 10), bool), axes, DIMS, "mask")
+    for number in range(12):
+        body[4, 4, number % 10] = True
+        body.to_netcdf(tiny_experiment.parent / f"{number}.nc", engine="h5netcdf")
+    experiment = read_experiment(tiny_experiment)
+    pairs = [pair for pair in experiment.numbers if pair != 0]
+
+    def made():
+        return {pair: stamps.of_pair(experiment, "", pair).vectors for pair in pairs}
+
+    before = {pair: provenance.Marks(**stamp.attributes) for pair, stamp in made().items()}
+    file = tiny_experiment.parent / "5.nc"
+    content = file.read_bytes()
+    file.unlink()
+    file.write_bytes(content)  # a copy: other times
+    assert all(stamp.fits(before[pair]) for pair, stamp in made().items())
+    file.unlink()
+    (~body).to_netcdf(file, engine="h5netcdf")
+    found = {pair: stamp.changes(before[pair]) for pair, stamp in made().items()}
+    assert {pair: names for pair, names in found.items() if names} == {pair: ["mask_files"] for pair in changed}

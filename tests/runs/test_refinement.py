@@ -6,11 +6,13 @@ import json
 import numpy as np
 import pytest
 
+from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.runs import guard, memory, pipeline, refinement
 from lfpiv.runs.refinement import Refinement
+from lfpiv.settings.volume import Box
 from lfpiv.warn import Code
 
 
@@ -63,10 +65,15 @@ def test_estimates_of_memory_count_the_finer_voxels(experiment):
 
 
 def test_finer_voxels_are_solid_where_their_centres_are(experiment):
-    solid = np.random.default_rng(0).random(experiment.grid.shape) < 0.3
-    finer = refinement.refined(guard.with_guard(dataclasses.replace(experiment, solid=solid), ((1, 1),) * 3), 1.3)
-    np.testing.assert_array_equal(finer.solid[experiment.grid.nearest_in(finer.grid)], solid)
-    assert finer.solid.shape == finer.grid.shape
+    box = Box(centre_mm=tuple(experiment.grid.centre_mm), size_mm=(0.3, 0.4, 0.2))
+    masked = dataclasses.replace(
+        experiment, mask=Mask(path=experiment.path, grid=experiment.grid, file=None, solid=(box,))
+    )
+    frame = experiment.pair_frames(0)[0]
+    finer = refinement.refined(guard.with_guard(masked, ((1, 1),) * 3), 1.3).grid
+    solid = masked.solid(frame, finer)
+    assert solid.shape == finer.shape and 0 < solid.mean() < 1
+    np.testing.assert_array_equal(solid[experiment.grid.nearest_in(finer)], masked.solid(frame))
 
 
 @pytest.mark.slow
