@@ -69,6 +69,30 @@ def test_a_wall_pulls_no_vector(flow, solid):
     assert np.linalg.norm(error, axis=-1).mean() < 3 * BIAS
 
 
+@pytest.mark.parametrize(
+    "flow", [uniform(0, 0, 3.3), uniform(0, 0, 0.3)], ids=["with the body", "slower than the body"]
+)
+def test_a_body_that_moves_pulls_no_vector(flow):
+    """Windows that the body touches in either frame use what is fluid in both."""
+    step = np.array([0, 0, 3.3])
+    bodies = [lambda at, sign=sign: np.abs((at - sign * step / 2)[..., 2] - 22) < 3 for sign in (-1, 1)]
+    masks = [mask_of(body) for body in bodies]
+    volumes = [moved[number] for number, moved in enumerate(wall_pair(flow, body) for body in bodies)]
+    axes = dict(zip("zyx", map(np.arange, SHAPE), strict=True))
+    given = [
+        xr.DataArray(volume, axes | {"masked": (tuple("zyx"), mask)}, tuple("zyx"))
+        for volume, mask in zip(volumes, masks, strict=True)
+    ]
+    result = plain_steps.correlate(*given, dt_s=1e-3, windows=(16, WINDOW, WINDOW))
+    windows = Windows.covering(SHAPE, (WINDOW,) * 3, (WINDOW // 2,) * 3)
+    share = windows.means(~(masks[0] | masks[1]))
+    np.testing.assert_array_equal(result["masked"].values, share < LEAST_FLUID - 1e-9)
+    near = (share < 1) & ~result["masked"].values & result["valid"].values
+    assert near.sum() >= 8
+    error = error_of(result, flow)[near]
+    assert np.abs(error.mean(0)).max() < BIAS and np.linalg.norm(error, axis=-1).mean() < 3 * BIAS
+
+
 def test_masked_vectors_are_told_from_replaced_ones():
     solid = mask_of(oblique)
     result = correlate(wall_pair(uniform(0, 1, 0), oblique), mask=solid)
