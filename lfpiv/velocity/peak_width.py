@@ -13,12 +13,16 @@ from lfpiv.velocity.settings import REFINE_SEARCH, Triple
 from lfpiv_kernels.correlation import sums
 from lfpiv_kernels.correlation.correlate import PEAK_REACH
 from lfpiv_kernels.correlation.light import fluctuation
-from lfpiv_kernels.transfer import Values
+from lfpiv_kernels.transfer import Values, to_host
 
 OWN = 0.2
 """Autocorrelation of the volumes below which a lag no longer belongs to a peak."""
 LARGEST_REACH = 8
 """Largest reach [voxel]. Particles as large as that take more than a window."""
+BLOCK = 24
+"""Edge of the blocks in which the autocorrelation of a larger volume is taken [voxel]."""
+PLACES = ((0.25, 0.25, 0.25), (0.25, 0.75, 0.75), (0.75, 0.25, 0.75), (0.75, 0.75, 0.25))
+"""Places of the blocks (z, y, x) along the way that a block can go."""
 
 
 def peak_reach(first: Values, second: Values, window: Triple) -> int:
@@ -34,15 +38,30 @@ def peak_reach(first: Values, second: Values, window: Triple) -> int:
     window : (int, int, int)
         Last window (z, y, x) [voxel]. The mean over it is subtracted: light that varies slowly is no particle.
     """
-    fluctuations = [fluctuation(volume, window) for volume in (first, second)]
-    power = sums.power(fluctuations)
-    if not power > 0:
+    for given in (_blocks(first), [first, second]):
+        fluctuations = [fluctuation(volume, window) for volume in given]
+        power = sums.power(fluctuations)
+        if power > 0:
+            break
+    else:
         return PEAK_REACH
+    shape = fluctuations[0].shape
     for reach in range(PEAK_REACH, LARGEST_REACH):
-        axes = [axis for axis in range(3) if first.shape[axis] > 2 * (reach + 1)]
+        axes = [axis for axis in range(3) if shape[axis] > 2 * (reach + 1)]
         if not axes or min(sums.lag_products(fluctuations, reach + 1, axes)) < OWN * power:
             return reach
     return LARGEST_REACH
+
+
+def _blocks(volume: Values) -> list[Values]:
+    """Return a volume, or blocks of a large volume: particles are as wide elsewhere, and in the other volume."""
+    edges = [min(n, BLOCK) for n in volume.shape]
+    if len(PLACES) * math.prod(edges) >= math.prod(volume.shape):
+        return [volume]
+    corners = [
+        [round(at * (n - edge)) for at, n, edge in zip(place, volume.shape, edges, strict=True)] for place in PLACES
+    ]
+    return [to_host(volume[z : z + edges[0], y : y + edges[1], x : x + edges[2]]) for z, y, x in corners]
 
 
 def refine_search(reach: int) -> Triple:

@@ -24,7 +24,6 @@ from lfpiv.velocity.volume_pair import (
     voxel_axes,
     without,
 )
-from lfpiv_kernels.correlation.light import powered
 from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.transfer import DeviceArray
 
@@ -79,7 +78,7 @@ class PreparedPair:
     def without_standing_light(self, last: Pass) -> Pass:
         """Return the last pass without the vectors of windows in which light brighter than particles stays in place."""
         power = 1 / self.settings.intensity_power
-        lights = powered(self.first, power), powered(self.second, power)
+        lights = preprocess(self.first, 0, power), preprocess(self.second, 0, power)
         standing = on_standing_light(*lights, last.given.windows, last.field, last.valid)
         if not standing.any():
             return last

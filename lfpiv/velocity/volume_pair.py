@@ -71,12 +71,20 @@ def normalise(values: np.ndarray, name: str, solid: np.ndarray | None = None) ->
         bad = values.size - int(np.isfinite(values).sum())
         raise ValueError(f"{name}: expected finite intensities, found {bad} that are not. Replace them, by 0 say.")
     inside = values.ravel() if solid is None else values[~solid]
-    background = np.median(inside[:: 1 + inside.size // _BACKGROUND_SAMPLES])
+    background = _median(inside[:: 1 + inside.size // _BACKGROUND_SAMPLES])
     normalised: np.ndarray = values - background
     normalised /= max(highest - float(background), float(background) - lowest, float(np.finfo(np.float32).tiny))
     if solid is not None:
         normalised[solid] = 0
     return normalised
+
+
+def _median(values: np.ndarray) -> np.floating:
+    """Return what `numpy.median` does of finite numbers, in a quarter of its time: it sorts about one place."""
+    half = values.size // 2
+    parted = np.partition(values, half)
+    upper: np.floating = parted[half]
+    return upper if values.size % 2 else (parted[:half].max() + upper) / upper.dtype.type(2)
 
 
 def missing_smoothing(smoothing_voxel: float, *volumes: xr.DataArray | np.ndarray) -> float:

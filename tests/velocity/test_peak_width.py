@@ -31,6 +31,16 @@ def test_particles_of_about_a_voxel_have_the_least_reach(sigma):
     assert refine_search(2) == (3, 3, 3)
 
 
+@pytest.mark.parametrize("sigma", [0.7, 1.2, 2.0])
+def test_blocks_of_a_large_volume_tell_its_reach(sigma):
+    first, second = pair_at(1, shape=(48, 72, 72), sigma=sigma, density=0.01)
+    middle = (slice(8, 40),) * 3
+    assert peak_reach(first, second, WINDOW) == peak_reach(first[middle], second[middle], WINDOW)
+    alone = np.zeros_like(first)
+    alone[20:28, 30:42, 30:42] = first[20:28, 30:42, 30:42]  # no light in the blocks
+    assert peak_reach(alone, second, WINDOW) == peak_reach(second, second, WINDOW)
+
+
 def test_the_reach_follows_the_narrowest_axis_and_no_slow_light():
     first, second = pair_at(1)
     stretched = [np.stack([volume] * 5).mean(0) for volume in (first, second)]

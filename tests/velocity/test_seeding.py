@@ -17,18 +17,18 @@ EDGE = 4.0
 """Largest distance of the edge that is found from the true one [voxel]: about a particle distance."""
 
 
-def pair_of(seeded, *, density=0.017, brightness=None, ghosts=0.0, seed=0):
+def pair_of(seeded, *, density=0.017, brightness=None, ghosts=0.0, seed=0, shape=SHAPE):
     """Two volumes of particles where `seeded(position)` is true, and faint ghosts everywhere."""
     rng, margin = np.random.default_rng(seed), 6
-    room = np.array(SHAPE) + 2 * margin
+    room = np.array(shape) + 2 * margin
     position = rng.random((int(density * room.prod()), 3)) * room - margin
     position = position[seeded(position)]
     light = rng.lognormal(0, 0.5, len(position)) * (1 if brightness is None else brightness(position))
     pair = []
     for sign in (-0.5, 0.5):
-        volume = blobs(position + sign * DISPLACEMENT, light, SHAPE)
+        volume = blobs(position + sign * DISPLACEMENT, light, shape)
         faint = rng.random((int(density * room.prod()), 3)) * room - margin
-        pair.append(volume + blobs(faint, np.full(len(faint), ghosts), SHAPE))
+        pair.append(volume + blobs(faint, np.full(len(faint), ghosts), shape))
     return pair
 
 
@@ -62,6 +62,16 @@ def test_a_reflection_does_not_make_the_rest_empty():
     for volume in pair:
         volume[:, 20:23, 20:23] += 100 * volume.max()
     assert unseeded_voxels(pair) is None
+
+
+def test_an_empty_layer_of_a_large_volume_is_found():
+    """Local maxima are sought in some planes of it, and means of the first volume over coarse cells come first."""
+    shape, thickness = (64, 72, 72), 12
+    empty = unseeded_voxels(pair_of(lambda position: position[:, 0] >= thickness, shape=shape))
+    along = empty.mean((1, 2))
+    assert (along[: int(thickness - EDGE)] == 1).all() and (along[int(thickness + EDGE) :] == 0).all()
+    assert unseeded_voxels(pair_of(everywhere, shape=shape)) is None
+    assert unseeded_voxels(pair_of(everywhere, shape=shape, density=0.0015)) is None
 
 
 def test_solid_space_is_left_out_of_the_means():
