@@ -6,6 +6,9 @@ grid gets the mean logarithm of the light that its rays meet. Where a particle i
 fluctuations are correlated. Ghosts are crossings of rays from different particles. They appear in the covariance of
 different instants as well, as do static light and the edges of the lit region, and this is subtracted. What is left,
 averaged over layers parallel to a face and relative to the volume, is the profile of lit particles beyond the face.
+
+Particles inside the volume blur beyond its faces. So light that was found is compared with a null: images of random
+particles inside the volume, as many as give images of the same contrast, are measured in the same way.
 """
 
 from __future__ import annotations
@@ -55,6 +58,12 @@ CLEAR = 4.0
 """Least covariance within the volume for a measurement [standard deviation of chance]."""
 SHIFTS = (5, 11)
 """Shifts of one camera's light at which chance is measured: the first, and the one after the last [cell]."""
+DRAWS = 16
+"""Sets of random particles inside the volume that light beyond it is compared with."""
+DRAWN, MOST_DRAWN = 1000, 100_000
+"""Particles whose contrast tells the number for the images' contrast, and the largest number."""
+GRAIN = 2.0
+"""Standard deviation of the Gaussian above which light counts as grains, the particles [lens]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,19 +117,58 @@ def light_beyond(
         return ()
     search = _Search.around(grid, calibration)
     group = np.repeat(np.arange(len(pairs)), [len(instants) for instants in pairs])
-    fluctuations, seen = [], []
-    for name, camera in calibration.cameras.items():
-        view = _View(camera, search.grid)
-        fluctuations.append(np.stack([view.fluctuation(one[name]) for instants in pairs for one in instants]))
-        seen.append(view.seen)
-    found = list[tuple[float, FaceLight]]()
-    for axis in range(3):
-        profile = _profile(fluctuations, seen, search, group, axis)
-        if profile is not None:
-            found += [face for side in (0, 1) if (face := _face(profile, search, axis, side)) is not None]
-    if not any(significance > SIGNIFICANT for significance, _ in found):
+    views = [_View(camera, search.grid) for camera in calibration.cameras.values()]
+    seen = [view.seen for view in views]
+    light = [
+        [view.light(one[name]) for instants in pairs for one in instants]
+        for name, view in zip(calibration.cameras, views, strict=True)
+    ]
+    fluctuations = [np.stack([*map(view.fluctuation, each)]) for view, each in zip(views, light, strict=True)]
+    profiles = [_profile(fluctuations, seen, search, group, axis) for axis in range(3)]
+    clear = [axis for axis, profile in enumerate(profiles) if profile.is_clear(search.inner(axis))]
+
+    def lit_faces(null: Sequence[np.ndarray]) -> list[FaceLight]:
+        """Return the significant faces, beyond what `null` expects in the layers of each axis."""
+        found = [
+            face
+            for axis in clear
+            for side in (0, 1)
+            if (face := _face(profiles[axis], search, axis, side, null[axis])) is not None
+        ]
+        some = any(significance > SIGNIFICANT for significance, _ in found)
+        return [face for significance, face in found if some and significance > CONFIRMED]
+
+    if not lit_faces([np.zeros((1, n)) for n in search.grid.shape]):
         return ()
-    return tuple(face for significance, face in found if significance > CONFIRMED)
+    return tuple(lit_faces(_null(views, light, search, grid)))
+
+
+def _null(
+    views: Sequence[_View], light: Sequence[Sequence[np.ndarray]], search: _Search, volume: Grid
+) -> list[np.ndarray]:
+    """Return the relative profiles of particles inside the volume alone, for each axis, shape (draw, layer)."""
+    rng = np.random.default_rng(0)
+
+    def draw(count: int) -> np.ndarray:
+        size = volume.voxel_mm * np.array(volume.shape[::-1])
+        points: np.ndarray = volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * size
+        return points
+
+    def contrast(images: Sequence[Sequence[np.ndarray]]) -> float:
+        found = [view.contrast(one) for view, each in zip(views, images, strict=True) for one in each]
+        return float(np.mean(found))
+
+    some = draw(DRAWN)
+    known = contrast([[view.light_of(some)] for view in views])
+    count = int(np.clip(DRAWN * known / max(contrast(light), 1e-9), 2, MOST_DRAWN))
+    profiles = [list[np.ndarray]() for _ in range(3)]
+    for _ in range(DRAWS):
+        points = draw(count)
+        fluctuations = [view.fluctuation(view.light_of(points))[None] for view in views]
+        for axis, found in enumerate(profiles):
+            same = _profile(fluctuations, [view.seen for view in views], search, np.zeros(1, int), axis).same
+            found.append(same / same[search.inner(axis)].mean())
+    return [np.array(found) for found in profiles]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +228,9 @@ class _View:
         self._blur_lenses = BLUR * max(grid.voxel_mm * abs(optics.magnification) / lattice.pitch_mm, 1.0)
         pupil = spread_over_pupil(1.0)[:PUPIL_POINTS]
         pupil *= PUPIL_SHARE * optics.pupil_radius_mm / np.linalg.norm(pupil, axis=1).max()
-        rays = np.moveaxis(camera.map_fan(grid.centres_mm(), pupil), 1, 0)
         lenses = decoder.lens_grid()
-        inverse = np.linalg.inv(np.asarray(lattice.basis_mm))
-        self._places = np.moveaxis((rays - np.asarray(lattice.origin_mm)) @ inverse - lenses[0, 0], -1, 1)
+        self._camera, self._pupil, self._first_lens = camera, pupil, lenses[0, 0]
+        self._places = self._places_of(grid.centres_mm())
         at = lattice.centres_mm(lenses) * (1 + optics.sensor_per_pupil)
         pixels = np.rint(optics.sensor_px(at - pupil[:, None, None] * optics.sensor_per_pupil)).astype(int)
         column, row = np.moveaxis(pixels, -1, 0)
@@ -197,15 +244,47 @@ class _View:
         self.seen: np.ndarray = np.mean(reached, axis=0) > SEEN_RAYS
         """Cells of which the camera sees nearly all rays, shape (z, y, x)."""
 
-    def fluctuation(self, image: np.ndarray) -> np.ndarray:
-        """Return the fluctuation of the mean logarithm of the light at the cells, shape (z, y, x)."""
+    def light(self, image: np.ndarray) -> np.ndarray:
+        """Return the smoothed sub-aperture images of a raw image, shape (pupil point, row, column)."""
         light = ndimage.uniform_filter(np.asarray(image, np.float32), BLUR_PX).reshape(-1)[self._pixels]
         light = np.divide(light, self._response, out=np.zeros_like(light), where=self._response > 0)
-        light = self._smooth(light) / np.maximum(self._weight, 1e-3)
+        smoothed: np.ndarray = self._smooth(light) / np.maximum(self._weight, 1e-3)
+        return smoothed
+
+    def light_of(self, points_mm: np.ndarray) -> np.ndarray:
+        """Return the smoothed sub-aperture images of points of equal brightness, shape (pupil point, row, column)."""
+        light = np.zeros(self._weight.shape, np.float32)
+        place = self._places_of(points_mm)  # pupil point, 2, point
+        for number, (row, column) in enumerate(place):
+            low = np.floor([row, column]).astype(int)
+            part = np.array([row, column]) - low
+            for i, j in product((0, 1), repeat=2):
+                share = np.abs(1 - i - part[0]) * np.abs(1 - j - part[1])
+                at = low + [[i], [j]]
+                inside = np.all((at >= 0) & (at < np.array(light.shape[1:])[:, None]), axis=0)
+                np.add.at(light[number], tuple(at[:, inside]), share[inside])
+        smoothed: np.ndarray = self._smooth(light * (self._response > 0)) / np.maximum(self._weight, 1e-3)
+        return smoothed
+
+    def contrast(self, light: np.ndarray) -> float:
+        """Return the variance of the grains of sub-aperture images over their squared mean, 1 / n for n particles."""
+        grains = light - ndimage.gaussian_filter(light, (0, GRAIN, GRAIN))
+        seen = self._weight > 0.5
+        return float(grains[seen].var() / max(float(light[seen].mean()), 1e-9) ** 2)
+
+    def fluctuation(self, light: np.ndarray) -> np.ndarray:
+        """Return the fluctuation of the mean logarithm of the light at the cells, shape (z, y, x)."""
         logarithm = np.log(np.maximum(light / max(float(light.mean()), 1e-9), 0.0) + DARK)
         mean = sum(self._at_cells(one, number) for number, one in enumerate(logarithm)) / len(logarithm)
         fluctuation: np.ndarray = ndimage.gaussian_filter(mean, FINE) - ndimage.gaussian_filter(mean, WIDE)
         return fluctuation
+
+    def _places_of(self, points_mm: np.ndarray) -> np.ndarray:
+        """Return the places of points in the sub-aperture images, shape (pupil point, 2, point) [lens]."""
+        lattice = self._camera.lattice
+        rays = np.moveaxis(self._camera.map_fan(points_mm, self._pupil), 1, 0) - np.asarray(lattice.origin_mm)
+        lenses = rays @ np.linalg.inv(np.asarray(lattice.basis_mm)) - self._first_lens
+        return np.moveaxis(lenses, -1, 1)
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         size = (0.0, self._blur_lenses, self._blur_lenses)
@@ -226,6 +305,8 @@ class _Profile:
     chance: np.ndarray
     """Deviations of products that only chance correlates from their mean, shape (layer, sample)."""
     instants: int
+    groups: int
+    """Groups of instants, each of which shows particles of its own."""
     seen: np.ndarray
     """Whether two cameras see most of the layer, shape (layer,), bool."""
 
@@ -233,11 +314,15 @@ class _Profile:
         """Return the standard deviation of the sum of `same` over layers if they hold no particles."""
         return float(self.chance[layers].sum(0).std() / np.sqrt(self.instants))
 
+    def is_clear(self, inner: slice) -> bool:
+        """Return whether the layers inside the volume show particles beyond chance."""
+        return bool(self.same[inner].sum() > CLEAR * self.deviation(np.arange(len(self.same))[inner]))
+
 
 def _profile(
     fluctuations: Sequence[np.ndarray], seen: Sequence[np.ndarray], search: _Search, group: np.ndarray, axis: int
-) -> _Profile | None:
-    """Average the covariances of all pairs of cameras over the layers across an axis; None without a clear signal."""
+) -> _Profile:
+    """Average the covariances of all pairs of cameras over the layers across an axis."""
     window = tuple(slice(None) if other == axis else search.inner(other) for other in range(3))
 
     def layered(values: np.ndarray) -> np.ndarray:
@@ -263,16 +348,20 @@ def _profile(
     same, chance, counts = (sum(part) for part in zip(*parts, strict=True))
     covered = counts > LEAST_SEEN * len(parts) * both.shape[2]
     counts = np.maximum(counts, 1.0)
-    profile = _Profile(same=same / counts, chance=chance / counts[:, None], instants=len(group), seen=covered)
-    inside = np.arange(len(counts))[search.inner(axis)]
-    clear = profile.same[inside].sum() > CLEAR * profile.deviation(inside)
-    return profile if clear else None
+    return _Profile(
+        same=same / counts,
+        chance=chance / counts[:, None],
+        instants=len(group),
+        groups=len(np.unique(group)),
+        seen=covered,
+    )
 
 
-def _face(profile: _Profile, search: _Search, axis: int, side: int) -> tuple[float, FaceLight] | None:
+def _face(profile: _Profile, search: _Search, axis: int, side: int, null: np.ndarray) -> tuple[float, FaceLight] | None:
     """Find how far light reaches beyond a face, and its significance; None if there is none.
 
-    The layer next to the face is blurred by light from within, so light must reach the second one.
+    `null` is the relative profile without light beyond the face, of several draws, shape (draw, layer). The layer next
+    to the face is blurred by light from within, so light must reach the second one.
     """
     inner, cell = search.inner(axis), search.grid.voxel_mm
     count = search.layers[axis][side]
@@ -280,13 +369,15 @@ def _face(profile: _Profile, search: _Search, axis: int, side: int) -> tuple[flo
     outside = outside[np.logical_and.accumulate(profile.seen[outside])]
     if len(outside) < 2:
         return None
-    relative = profile.same / profile.same[inner].mean()
+    level = profile.same[inner].mean()
+    relative = profile.same / level - null.mean(0)
     excess = np.cumsum(relative[outside[1:]] - LEAST_LIT)
     lit = int(excess.argmax()) + 2
-    deviation = profile.deviation(outside[1:lit])
+    layers = outside[1:lit]
+    deviation = math.hypot(profile.deviation(layers) / level, null[:, layers].sum(1).std() / profile.groups**0.5)
     if not (excess[lit - 2] > 0 and deviation > 0):
         return None
-    return float(profile.same[outside[1:lit]].sum()) / deviation, FaceLight(
+    return float(relative[layers].sum()) / deviation, FaceLight(
         axis=axis,
         side=side,
         reach_mm=round(lit * cell, 3),

@@ -29,17 +29,17 @@ def weights(calibration):
     return lfpiv.build_weights(calibration, around, form="profiles")
 
 
-def images_of(weights, low_mm, high_mm, *, seed=0, static=0.0):
-    """Images of particles between two depths [mm], five pairs of one frame; `static` light is in all of them."""
+def images_of(weights, low_mm, high_mm, *, seed=0, static=0.0, pairs=PAIRS, share=SHARE):
+    """Images of particles between two depths [mm], pairs of one frame; `static` light is in all of them."""
     rng, z = np.random.default_rng(seed), weights.grid.axis_mm(0)
     lit = ((z > low_mm) & (z < high_mm))[:, None, None]
-    pairs = []
-    for _ in range(PAIRS):
-        light = 1e4 * lit * (rng.random(weights.grid.shape) < SHARE) * rng.random(weights.grid.shape)
+    found = []
+    for _ in range(pairs):
+        light = 1e4 * lit * (rng.random(weights.grid.shape) < share) * rng.random(weights.grid.shape)
         images = weights(light.astype(np.float32))
         wall = {name: static * (np.arange(image.shape[1]) % 97 < 9) for name, image in images.items()}
-        pairs.append([{name: image + wall[name] + rng.normal(0, 0.5, image.shape) for name, image in images.items()}])
-    return pairs
+        found.append([{name: image + wall[name] + rng.normal(0, 0.5, image.shape) for name, image in images.items()}])
+    return found
 
 
 @pytest.mark.slow
@@ -53,6 +53,12 @@ def test_particles_beyond_a_face_are_found_and_only_there(calibration, weights):
 @pytest.mark.parametrize("static", [0.0, 30.0])
 def test_ghosts_beyond_the_faces_are_no_light(calibration, weights, static):
     assert light_beyond(calibration, VOLUME, images_of(weights, -HALF_MM, HALF_MM, static=static)) == ()
+
+
+@pytest.mark.slow
+def test_few_particles_at_the_faces_of_single_pairs_are_no_light_beyond(calibration, weights):
+    single = [images_of(weights, -HALF_MM, HALF_MM, seed=seed, pairs=1, share=SHARE / 8) for seed in range(5, 9)]
+    assert [light_beyond(calibration, VOLUME, pairs) for pairs in single] == [()] * len(single)
 
 
 def test_one_camera_shows_no_depth(calibration, weights):
