@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
@@ -42,6 +42,12 @@ _CORE_PITCHES = 0.15  # radius in which a microimage is evenly bright
 _LIT_LENS = 0.3  # least light of a lit lens, relative to the median
 _WHOLE_LENS = 0.8  # least number of pixels of a whole microimage, relative to the median
 _RING_PX = 0.25  # width of the rings of a microimage's profile
+_OUTERMOST = (
+    100  # the outermost hundredth of the pixels of microimages gives the dark level of an image without another
+)
+_DISC_REACH_PX, _DISCS = 2.0, 60  # reach and number of the radii of discs tried, below the half width of the profile
+_LEAST_BLUR_PX, _LARGEST_BLUR_PX, _BLURS = 0.3, 1.5, 10  # standard deviations of the blur tried; a pixel's own is 0.29
+_MODEL_ERROR = 0.01  # of the profile of a blurred disc, relative to its core, root mean square
 _CLEAR_PX, _CLEAR_WITHOUT_DARK_PX = 0.5, 2.0  # width of the gap beyond a microimage's edge
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
 _LIT_SHARE = 0.04  # least share of all light in a ninth of the sensor
@@ -86,9 +92,9 @@ def gap_light(image: np.ndarray, decoder: LightFieldDecoder) -> float:
 def microimage_px(white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> float | None:
     """Measure the diameter of the microimages in the white image [pixel].
 
-    One estimate is the distance at which the mean microimage is half as bright as its core. Uneven light hardly changes
-    it. The other is the ratio of all light to that of the cores. Blur and overlap do not change it. The estimate nearer
-    to the stated diameter is returned.
+    One estimate is a blurred disc, fitted to the mean microimage. Uneven light hardly changes it. The other is the
+    ratio of all light to that of the cores. Blur and overlap do not change it. The estimate nearer to the stated
+    diameter is returned, and of the discs that fit alike the nearest.
 
     Parameters
     ----------
@@ -115,17 +121,42 @@ def microimage_px(white: np.ndarray, dark: np.ndarray | None, decoder: LightFiel
         return None
     order = np.argsort(away[lit])
     light, away = (light[lit] / mean[lens[lit]])[order], away[lit][order]
+    if dark is None:
+        light -= np.median(light[-len(light) // _OUTERMOST :])
     core = max(float(np.median(light[away < max(_CORE_PITCHES * pitch, 1.0)])), 1e-9)
     rings = np.split(np.arange(len(away)), np.flatnonzero(np.diff(away // _RING_PX)) + 1)
     radius, profile = np.array([(away[ring].mean(), np.median(light[ring]) / core) for ring in rings]).T
     edge = int(np.flatnonzero(profile >= 0.5).max(initial=0))
     cell = pitch**2 * (3**0.5 / 2 if optics.layout == "hexagonal" else 1)
-    estimates = [2 * (float(light.mean() / core) * cell / np.pi) ** 0.5]
+    plateau, discs = 1.0, []
     if radius[-1] - radius[edge] > (_CLEAR_WITHOUT_DARK_PX if dark is None else _CLEAR_PX):
-        estimates.append(2 * float(np.interp(0.5, profile[[edge + 1, edge]], radius[[edge + 1, edge]])))
+        inner = radius < max(pitch / 2, radius[edge] + 1)
+        plateau, smallest, largest = _fitted_discs(radius[inner], profile[inner], float(radius[edge]))
+        discs = [float(np.clip(stated_px(optics), 2 * smallest, 2 * largest))]
     elif dark is None:
         return None
+    estimates = [2 * (float(light.mean() / core / plateau) * cell / np.pi) ** 0.5, *discs]
     return float(min(estimates, key=lambda diameter: abs(diameter - stated_px(optics))))
+
+
+def _fitted_discs(radius: np.ndarray, profile: np.ndarray, near: float) -> tuple[float, float, float]:
+    """Fit discs under a Gaussian blur to the profile of a microimage.
+
+    Return the brightness of the best disc, and the smallest and the largest radius of discs that fit as well within the
+    model's own error [pixel]. Of microimages of few pixels blur and radius are hardly told apart.
+
+    `near` is the radius at which the profile falls below a half.
+    """
+    radii = np.linspace(max(0.4 * near, near - _DISC_REACH_PX), 1.05 * near + 0.5, _DISCS)[:, None, None]
+    blur = np.geomspace(_LEAST_BLUR_PX, max(_LARGEST_BLUR_PX, near / 4), _BLURS)[:, None]
+    shapes = special.chndtr((radii / blur) ** 2, 2, (radius / blur) ** 2)  # (disc, blur, ring)
+    weight = radius  # a ring's pixels
+    brightness = (shapes * profile) @ weight / np.maximum(shapes**2 @ weight, 1e-9)
+    rest = np.sqrt((brightness[..., None] * shapes - profile) ** 2 @ weight / weight.sum())
+    best = rest.min(1)
+    chosen = int(best.argmin())
+    fits = radii[best <= np.hypot(best[chosen], _MODEL_ERROR)]
+    return float(brightness[chosen, rest[chosen].argmin()]), float(fits.min()), float(fits.max())
 
 
 def stated_px(optics: Optics) -> float:

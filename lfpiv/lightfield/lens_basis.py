@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import fft, ndimage
+from scipy import fft, ndimage, optimize
 
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LAYOUTS
@@ -31,8 +31,14 @@ NARROWEST_MEAN_PX = 3
 """Least width of the local mean [pixel]."""
 PEAK_REACH = 0.9
 """Longest lag of a peak, relative to the longest lag."""
-DISC_RADII = np.arange(0.2, 0.81, 0.02)
-"""Radii of microimages tried [pitch]. Four of the largest overlap in the middle between their lenses."""
+MEAN_PITCHES = 2
+"""Width of the local mean that the light is compared with [pitch]."""
+RADII = np.concatenate([np.arange(0.02, 0.2, 0.03), np.arange(0.2, 1.21, 0.04)])
+"""Radii of the discs and squares that microimages are made of [pitch]. The largest are those of blurred overlaps."""
+EXPLAINED_RATIO, LEAST_UNEXPLAINED = 0.4, 0.003
+"""Unexplained light about a lens centre over that about a gap, at most, and the share added to both before."""
+TURNS = {"square": np.array([[0, -1], [1, 0]]), "hexagonal": np.array([[0, -1], [1, 1]])}
+"""A quarter turn, and a sixth of a turn, in lattice indices (i, j)."""
 
 
 def find_basis(image: np.ndarray, nominal: float | None, layout: str) -> np.ndarray:
@@ -226,38 +232,67 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
     """Return a lens centre (column, row) near the image's middle, correct to about a pixel [pixel].
 
     The mean cell is symmetric under a quarter turn (hexagonal: a sixth) about a lens centre. A square cell has the same
-    symmetry about the gap between four lenses. The cell correlates better with discs about the lens centres than with
-    discs about the gaps, even where overlaps make the gap brighter than the centre.
+    symmetry about the gap between four lenses. `_unexplained` tells the two apart by their light.
+
+    Raises
+    ------
+    InputError
+        If the light of a square cell fits microimages about both centres, or about neither.
     """
     pitch = lattice_pitch(basis, layout)
-    crop = _flattened(_middle(image), pitch)
+    crop = _middle(image)
+    mean = ndimage.uniform_filter(crop, 2 * round(MEAN_PITCHES * pitch / 2) + 1)
     bins = 2 * int(np.clip(pitch / 2, 3, 16))
-    cell = _mean_cell(crop, basis, bins)
+    cell = _mean_cell(crop / np.maximum(mean, 0.1 * max(float(mean.max()), 1e-30)), basis, bins)
 
-    turn = np.array([[0, -1], [1, 1]]) if layout == "hexagonal" else np.array([[0, -1], [1, 0]])
     place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 2)
     offset = place[:, None] - place[None]  # (point, centre, 2), for every bin as centre
-    turned = (place[None] + offset @ turn.T) % bins
-    symmetry = (cell.reshape(-1, 1) * cell[turned[..., 0], turned[..., 1]]).sum(0)
+    turned = (place[None] + offset @ TURNS[layout].T) % bins
+    contrast = cell - cell.mean()
+    symmetry = (contrast.reshape(-1, 1) * contrast[turned[..., 0], turned[..., 1]]).sum(0)
     centre = place[np.argmax(symmetry)]
     if layout == "square":
-        centre = max(centre, (centre + bins // 2) % bins, key=lambda middle: _disc_correlation(cell, basis, middle))
+        centres = [centre, (centre + bins // 2) % bins]
+        found = [_unexplained(np.roll(cell, -middle, (0, 1)), basis) for middle in centres]
+        if not min(found) + LEAST_UNEXPLAINED < EXPLAINED_RATIO * (max(found) + LEAST_UNEXPLAINED):
+            raise InputError(
+                "white: expected light that tells the centres of the microimages from the gaps between four of them, "
+                f"found that microimages about either explain it to {100 * (1 - max(found)):.1f} and "
+                f"{100 * (1 - min(found)):.1f} %. Use a white image with dark gaps, from a smaller aperture of the "
+                "main lens, and a dark image."
+            )
+        centre = centres[int(np.argmin(found))]
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
     phase: np.ndarray = centre / bins @ basis + start
     return phase
 
 
-def _disc_correlation(cell: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> float:
-    """Return the correlation of a cell with equal discs about the lattice nodes at `centre`, for the best radius."""
+def _unexplained(cell: np.ndarray, basis: np.ndarray) -> float:
+    """Return the share of a square cell's contrast that no microimages about its first bin explain.
+
+    Microimages are sums of discs and squares of any radii, so they do not grow brighter outwards. They stand on a level
+    that is not darker than black. The cell is averaged over its turns and mirror images, against noise and slopes.
+    """
     bins = len(cell)
-    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 1, 2) - centre
-    around = bins * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1), indexing="ij"), -1).reshape(1, -1, 2)
-    inner = (place + bins // 2) % bins - bins // 2
-    pitch = np.hypot(*basis[0])
-    away = np.linalg.norm((inner - around) @ basis / bins, axis=-1)
-    found = [np.clip((radius * pitch - away) * bins / pitch + 0.5, 0, 1).sum(1) for radius in DISC_RADII]
-    flat = cell.ravel() - cell.mean()
-    return max(float(flat @ (disc - disc.mean())) / max(float(disc.std()), 1e-9) for disc in found)
+    place = np.stack(np.meshgrid(np.arange(bins), np.arange(bins), indexing="ij"), -1).reshape(-1, 1, 2)
+    turned = [cell]
+    for _ in range(3):
+        turned.append(np.roll(turned[-1][::-1].T, 1, axis=1))
+    light = sum(part + part.T for part in turned).ravel() / 8
+    light -= min(float(light.min()), 0.0)
+    around = np.stack(np.meshgrid(range(-2, 3), range(-2, 3), indexing="ij"), -1).reshape(1, -1, 2)
+    away = (place / bins + 0.5) % 1 - 0.5 - around  # [lattice index]
+    round_, square = np.linalg.norm(away @ basis, axis=-1) / np.hypot(*basis[0]), np.abs(away).max(-1)
+    rest = [
+        optimize.nnls(np.column_stack([np.ones(bins * bins), *_discs(distance, bins)]), light)[1]
+        for distance in (round_, square)
+    ]
+    return float(min(rest) ** 2 / max(((light - light.mean()) ** 2).sum(), 1e-30))
+
+
+def _discs(distance: np.ndarray, bins: int) -> list[np.ndarray]:
+    """Return equal discs, one for each of `RADII`, from the distances to their middles (bin, disc) [pitch]."""
+    return [np.clip((radius - distance) * bins + 0.5, 0, 1).sum(1) for radius in RADII]
 
 
 def _mean_cell(crop: np.ndarray, basis: np.ndarray, bins: int) -> np.ndarray:

@@ -260,6 +260,8 @@ def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
         (23.3, "hexagonal", 0.85, 1.5, False),
         (9.1, "hexagonal", 1.0, 1.0, True),
         (7.0, "square", 0.75, 0.5, False),
+        (18.25, "square", 0.18, 0.6, True),
+        (10.0, "hexagonal", 0.3, 0.6, False),
     ],
 )
 def test_the_white_image_shows_the_diameter_of_the_microimages(pitch_px, layout, fill, blur, dark):

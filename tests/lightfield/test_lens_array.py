@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
@@ -95,6 +96,26 @@ def test_centres_follow_the_lattice_at_every_pixel_phase(pitch, rotation, layout
         assert worst_error(array, origin, basis) < TOLERANCE_CLEAN
         assert array.pitch_px == pytest.approx(pitch, rel=1e-4)
         assert array.rotation_deg == pytest.approx(rotation, abs=5e-3)
+
+
+@pytest.mark.parametrize("dark_known", [True, False])
+@pytest.mark.parametrize(("pitch", "rotation"), [(9.7, 1.3), (20.0, 0.0), (41.3, -7.0)])
+@pytest.mark.parametrize("diameter_px", [1.6, 3.0, 5.5])
+def test_spots_of_a_small_aperture_are_centred_on_their_light(pitch, rotation, diameter_px, dark_known):
+    shape, basis, rng = (260, 300), basis_of(pitch, rotation, "square"), np.random.default_rng(int(10 * pitch))
+    origin = np.array(shape[::-1]) / 2 + rng.uniform(-pitch, pitch, 2)
+    white = expose(render(shape, origin, basis, diameter_px, soft=0.3), rng)
+    dark = expose(np.zeros(shape), rng) if dark_known else None
+    array = find_lens_array(white, dark, nominal_pitch_px=pitch)
+    assert worst_error(array, origin, basis) < TOLERANCE_NOISY
+
+
+def test_light_that_fits_centres_and_gaps_alike_is_refused():
+    """Blurred overlaps on an unknown level look like spots in the gaps."""
+    basis = basis_of(12.4, 0.3, "square")
+    white = 1000 * (2 + ndimage.gaussian_filter(render((200, 220), np.array([100.0, 90.0]), basis, 1.4 * 12.4), 2))
+    with pytest.raises(InputError, match=r"tells the centres of the microimages from the gaps .* dark gaps"):
+        find_lens_array(white, nominal_pitch_px=12.4)
 
 
 @pytest.mark.parametrize("square", [False, True])
