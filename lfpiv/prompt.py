@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lfpiv.quantities import scale_of
+from lfpiv.quantities import quantity, scale_of
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,19 @@ def seconds(value: float) -> str:
     """
     scale = scale_of(value, "s")
     return f"{value * scale.factor:.4g} {scale.unit.replace('µ', 'u')}"  # plain letters, for any terminal
+
+
+def movement(moved_voxel: float, voxel_mm: float, dt_s: float) -> str:
+    """Return a displacement in voxels as length and speed, in the units that people use.
+
+    Examples
+    --------
+    >>> movement(2.34, 0.1, 1e-4)
+    '2.34 voxel = 234 um in 100 us, 2.34 m/s'
+    """
+    metres = moved_voxel * voxel_mm / 1000
+    text = f"{moved_voxel:.3g} voxel = {quantity(metres, 'm')} in {seconds(dt_s)}, {quantity(metres / dt_s, 'm/s')}"
+    return text.replace("µ", "u")  # plain letters, for any terminal
 
 
 def times(values: Sequence[float]) -> str:

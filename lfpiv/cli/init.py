@@ -282,7 +282,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
 
     if path.exists():
         raise InputError(f"{path}: expected a new file to write, found one that exists. Name another, or remove it.")
-    answers = _answers(given, path.absolute().parent.name)
+    answers = _answers(given, path)
     values = Values.model_validate(answers)
     text = experiment_text(values)
     table = validated(parse(text, path), path, ExperimentTable)
@@ -303,13 +303,13 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
     return Written(missing, vectors, tuple(warning.sentence for warning in warnings))
 
 
-def _answers(given: Mapping[str, str | None], folder: str) -> dict[str, Any]:
+def _answers(given: Mapping[str, str | None], path: Path) -> dict[str, Any]:
     """Read the given answers, and ask for the missing ones or take their defaults."""
     answers: dict[str, Any] = {}
     interactive, missing = sys.stdin.isatty(), []
     for one in QUESTIONS:
         text = given[one.key]
-        default = _default(one, answers, folder)
+        default = _default(one, answers, path)
         if text is None and interactive:
             answers[one.key] = _ask(one, default)
             continue
@@ -325,10 +325,14 @@ def _answers(given: Mapping[str, str | None], folder: str) -> dict[str, Any]:
     return answers
 
 
-def _default(one: Question, answers: Mapping[str, Any], folder: str) -> str | None:
-    """Return the default of a question, which may follow from earlier answers."""
+def _default(one: Question, answers: Mapping[str, Any], path: Path) -> str | None:
+    """Return the default of a question, which may follow from earlier answers or, when asked, from a recording."""
     if one.key == "name":
-        return folder or "experiment"
+        return path.absolute().parent.name or "experiment"
+    if one.key == "dt_s" and sys.stdin.isatty() and {"cameras", "particle_images"} <= set(answers):
+        from lfpiv.experiment.recorded_times import proposed
+
+        return proposed(path, answers["particle_images"], answers["cameras"][0][0])
     if one.key == "voxel_mm" and {"microlens_pitch_mm", "magnification"} <= set(answers):
         return f"{answers['microlens_pitch_mm'] / abs(answers['magnification']):.3g}"
     return one.default

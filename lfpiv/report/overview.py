@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.prompt import movement
 from lfpiv.quantities import quantity
 from lfpiv.report import markup, verdicts
 from lfpiv.report.markup import number, percent
@@ -84,6 +85,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ("Experiment file", str(experiment.path)),
         ("Volume", f"{size[0]:g} × {size[1]:g} × {size[2]:g} mm (x, y, z), {nx} × {ny} × {nz} voxels of {voxel:g} mm"),
         _interval(experiment),
+        _moved(experiment, summary),
         (
             "Cameras",
             ", ".join(f"{camera.name}{_orientation(camera)}" for camera in experiment.cameras)
@@ -116,6 +118,15 @@ def _interval(experiment: Experiment) -> tuple[str, str]:
     if series is None:
         return "Time between frames", f"{interval}: {speed}"
     return "Time between instants", f"{interval}{_later(series.step)}: {speed}"
+
+
+def _moved(experiment: Experiment, summary: Summary) -> tuple[str, str]:
+    """State how far and how fast the particles of the first pair move, for a look at ``dt_s`` and the lengths."""
+    pair = next((one for one in summary.pairs if one.moved_voxel is not None), None)
+    if pair is None or pair.moved_voxel is None:
+        return "Median movement", ""
+    text = movement(pair.moved_voxel, experiment.grid.voxel_mm, experiment.dt_s)
+    return "Median movement", f"{text}, in {experiment.name_of(pair.number)}"
 
 
 def _later(step: int) -> str:

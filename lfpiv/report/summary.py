@@ -102,6 +102,7 @@ class PairFigures(_Figures):
     velocity_m_per_s: dict[str, Spread]
     uncertainty_voxel: float | None
     peak_ratio: float | None
+    moved_voxel: float | None = None
     motion: MotionFigures = MotionFigures()
     residual: dict[str, tuple[float, ...]] = {}
     stop: dict[str, str] = {}

@@ -357,7 +357,8 @@ class PairWork:
         def write() -> None:
             files.write_vectors(vectors, condensed, attributes)
             name = experiment.name_of(files.pair)
-            log.info("%s: %.0f %% of the vectors valid", name, 100 * figures.valid_fraction)
+            valid, moved = 100 * figures.valid_fraction, figures.moved(experiment.grid.voxel_mm, experiment.dt_s)
+            log.info("%s: %.0f %% of the vectors valid; median movement %s", name, valid, moved)
 
         self.write(write)
 

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import files, warn
+from lfpiv.prompt import movement
 from lfpiv.reconstruction.motion import Motion
 from lfpiv.records import RecordError, validate
 from lfpiv.results import netcdf
@@ -72,6 +73,8 @@ class PairFigures:
     """Part of the vectors that two cameras see and where there are particles; None in files that do not state it."""
     unseeded_fraction: float = 0.0
     """Part of the volume that holds no particles."""
+    moved_voxel: float | None = None
+    """Median length of the displacements of the valid vectors; None in files that do not state it."""
     motion: MotionFigures | None = None
     """None without motion passes."""
     residual: Mapping[str, Sequence[float]] | None = None
@@ -81,6 +84,12 @@ class PairFigures:
     light_outside: ByFrame | None = None
     stop: Mapping[str, str] | None = None
     """Frame -> why the iteration ended."""
+
+    def moved(self, voxel_mm: float, dt_s: float) -> str:
+        """Return in words how far and how fast particles move; "nothing to measure" without valid vectors."""
+        if self.moved_voxel is None:
+            return "nothing to measure"
+        return movement(self.moved_voxel, voxel_mm, dt_s)
 
     @property
     def valid_share(self) -> float:
@@ -124,6 +133,7 @@ class PairFigures:
         return found
 
 
+_DISPLACEMENTS = ("displacement_x", "displacement_y", "displacement_z")
 _OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")
 
 
@@ -157,6 +167,7 @@ def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterabl
         reconstruction_s=float(vectors.attrs["reconstruction_s"]),
         correlation_s=float(vectors.attrs["correlation_s"]),
         velocity_m_per_s={name: _spread(vectors[name].values[valid & finite]) for name in ("u", "v", "w")},
+        moved_voxel=_median(np.sqrt(sum(vectors[name].values[valid & finite] ** 2 for name in _DISPLACEMENTS))),
         uncertainty_voxel=_median(vectors["uncertainty"].values[valid]),
         peak_ratio=_median(vectors["peak_ratio"].values[valid]),
         motion=_motion(vectors.attrs) if "motion" in vectors.attrs else None,

@@ -18,7 +18,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import recorded
+from lfpiv.experiment import recorded, recorded_times
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
@@ -37,7 +37,7 @@ from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.runs.todo import Todo
-from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs
+from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs, warn
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
@@ -67,6 +67,8 @@ def open_run(
     try:
         with contextlib.ExitStack() as stack:
             warnings = stack.enter_context(collected())
+            for warning in recorded_times.contradictions(experiment):
+                warn(log, warning)
             if writes_results:
                 stack.enter_context(folder.held())
                 folder.sweep()

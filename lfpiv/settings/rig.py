@@ -88,6 +88,17 @@ class NominalCamera(Table):
 Pixels = Annotated[int, Field(strict=True, ge=1, le=100_000)]
 
 
+class RawTime(Table):
+    """Table ``[camera.raw.time]``: a number in each image's block that says when it was recorded."""
+
+    at_byte: Annotated[int, Field(strict=True, ge=0, lt=2**40)]
+    """Place of the number, from the first byte of ``frame_header_bytes`` [byte]."""
+    dtype: Literal["uint32", "uint64", "int64", "float64"]
+    """Type of the number, of the byte order of the pixels."""
+    unit_s: Annotated[float, Field(strict=True, ge=1e-12, le=1)]
+    """Unit of the number [s]."""
+
+
 class RawImages(Table):
     """Table ``[camera.raw]``: layout of the camera's files without a header, ``.raw`` and ``.bin``."""
 
@@ -103,6 +114,16 @@ class RawImages(Table):
     """Length of what stands before the pixels of each image [byte]."""
     frame_footer_bytes: Annotated[int, Field(strict=True, ge=0, lt=2**31)] = 0
     """Length of what stands behind the pixels of each image, such as a time stamp and filling [byte]."""
+    time: RawTime | None = None
+    """Where each block states its time; absent: it does not."""
+
+    @model_validator(mode="after")
+    def _time_in_block(self) -> RawImages:
+        pixels = self.shape[0] * self.shape[1] * int(self.dtype.lstrip("uintfloa")) // 8
+        block = self.frame_header_bytes + pixels + self.frame_footer_bytes
+        if self.time is not None and self.time.at_byte + int(self.time.dtype[-2:]) // 8 > block:
+            raise ValueError(f"a time within the {block} bytes of an image's block")
+        return self
 
 
 class CameraTable(NominalCamera):

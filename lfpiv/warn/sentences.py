@@ -63,6 +63,7 @@ class Code(enum.Enum):
     CROWDED = "crowded"
     UNLINKED = "unlinked"
     # the run
+    TIME = "time"
     FEWER_WORKERS = "fewer_workers"
     ONE_GPU = "one_gpu"
     NO_LOCKS = "no_locks"
@@ -221,6 +222,10 @@ SENTENCES: Mapping[Code, str] = {
         "alone. Check the recording for repeated images"
     ),
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
+    Code.TIME: (
+        "the recording says that the two frames of a vector are {recorded} apart, dt_s says {stated}. Velocities are "
+        "wrong by the ratio of the two if dt_s is wrong: correct it"
+    ),
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"

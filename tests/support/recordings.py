@@ -14,7 +14,7 @@ SETUP_BYTES = 10392
 """Length of the SETUP structure up to ``WBType``."""
 
 
-def write_cine(path, frames, bits=16, *, first_image=-5, version=1, annotation=b"", top_down=False, **setup):
+def write_cine(path, frames, bits=16, *, interval_s=None, exposure_s=None, first_image=-5, blocks=True, **setup):
     """Write a Phantom ``.cine`` of monochrome images.
 
     Parameters
@@ -26,21 +26,22 @@ def write_cine(path, frames, bits=16, *, first_image=-5, version=1, annotation=b
         Bits of a stored pixel; 10 and 12 are the packed forms.
     first_image : int
         ``FirstImageNo``, the number of the first image relative to the trigger.
-    version : {0, 1}
-        0 stores the offsets of images in 32 bits, 1 in 64 bits.
-    annotation : bytes
-        Text before each image.
-    top_down : bool
-        Whether unpacked rows are stored from the top, which a negative ``biHeight`` says.
+    interval_s, exposure_s : float, optional
+        Time between images and their exposure, in the blocks of times.
+    blocks : bool
+        Whether there are blocks of times and exposures.
     **setup
-        ``RealBPP``, ``CFA`` of the SETUP structure; ``Compression`` of the file's header.
+        ``RealBPP``, ``CFA``, ``bFlipH``, ``bFlipV``, ``Rotate``, ``TrigFrame``, ``rate`` of the SETUP structure;
+        ``Compression`` of the file's header; ``version`` 0 for offsets in 32 bits; ``annotation``, a text before each
+        image; ``top_down`` where unpacked rows are stored from the top, which a negative ``biHeight`` says.
     """
     frames = np.asarray(frames)
     count, rows, columns = frames.shape
     packed = {10: PACKED_10, 12: PACKED_12}.get(bits, 0)
-    compression = setup.pop("Compression", 0)
+    compression, version = setup.pop("Compression", 0), setup.pop("version", 1)
+    annotation, top_down = setup.pop("annotation", b""), setup.pop("top_down", False)
     setup_at, blocks_at = 44 + 40, 44 + 40 + SETUP_BYTES
-    blocks = _tagged_blocks(count)
+    blocks = _tagged_blocks(count, interval_s or 2**-12, exposure_s or 2**-22) if blocks else b""
     offsets_at = blocks_at + len(blocks)
     images_at = offsets_at + count * (8 if version else 4)
     images = [_cine_pixels(frame, bits, top_down) for frame in frames]
@@ -103,6 +104,82 @@ def write_mraw(path, frames, bits=16, *, header="cih", **entries):
     path.with_suffix(".cih").write_text(text, "utf-8")
 
 
+def write_seq(path, frames, *, version=5, bits=None, interval_s=0.01, filling=40, **fields):
+    """Write a StreamPix ``.seq`` of grey images.
+
+    Parameters
+    ----------
+    path : Path
+    frames : array_like, shape (n, rows, columns)
+        Grey values of 8 or 16 bits.
+    version : int
+        From 5 on images begin at byte 8192 and times have microseconds.
+    bits : int, optional
+        Bits that are used, of those that are stored.
+    interval_s : float
+        Time between images.
+    filling : int
+        Bytes behind the time of each image.
+    **fields
+        ``count``, ``origin``, ``form`` and ``compression`` of the header.
+    """
+    frames = np.asarray(frames)
+    count, rows, columns = frames.shape
+    stored, length = 8 * frames.itemsize, rows * columns * frames.itemsize
+    times = struct.Struct("<IHH" if version >= 5 else "<IH")
+    head = struct.pack("<I24sii512x", 0xFEED, "Norpix seq\n".encode("utf-16-le"), version, 1024)
+    sizes = (columns, rows, stored, bits or stored, length, fields.get("form", 100), fields.get("count", count))
+    head += struct.pack("<9Id", *sizes, fields.get("origin", 0), length + times.size + filling, 30.0)
+    head = head.ljust(620, b"\0") + struct.pack("<I", fields.get("compression", 0))
+    with path.open("wb") as file:
+        file.write(head.ljust(8192 if version >= 5 else 1024, b"\0"))
+        for number, frame in enumerate(frames):
+            micro = round(number * interval_s * 1e6) + 999_500
+            parts = (1_700_000_000 + micro // 10**6, micro // 1000 % 1000, micro % 1000)
+            file.write(frame.astype(frame.dtype.newbyteorder("<")).tobytes())
+            file.write(times.pack(*parts[: 3 if version >= 5 else 2]) + b"\xff" * filling)
+
+
+def write_avi(path, frames, *, code=bytes(4), bits=8, palette=True, top_down=False, parts=1):
+    """Write an uncompressed ``.avi`` of bitmaps, or of a grey code whose rows are stored from the top.
+
+    Parameters
+    ----------
+    path : Path
+    frames : array_like, shape (n, rows, columns)
+    code : bytes
+        Four letters of the format; zeros for a bitmap.
+    bits : int
+        Bits that the bitmap states.
+    palette : bool or bytes
+        Whether there is a palette of grey values; or another one.
+    top_down : bool
+        Whether rows are stored from the top.
+    parts : int
+        Number of RIFF parts over which images are spread.
+    """
+    frames = np.asarray(frames)
+    count, rows, columns = frames.shape
+    greys = bytes(value for level in range(256) for value in (level, level, level, 0))
+    colours = greys if palette is True else palette or b""
+    form = (
+        struct.pack("<IiiHH4sIiiII", 40, columns, -rows if top_down else rows, 1, bits, code, 0, 0, 0, 0, 0) + colours
+    )
+    stream = _chunk(b"strh", b"vids" + code + bytes(48)) + _chunk(b"strf", form)
+    sound = _chunk(b"strh", b"auds" + bytes(52)) + _chunk(b"strf", bytes(18))
+    head = _chunk(b"avih", bytes(56)) + _list(b"strl", sound) + _list(b"strl", stream)
+    from_top = top_down or code.strip(b"\0") not in (b"", b"DIB ")
+    images = []
+    for frame in frames:
+        stored = np.ascontiguousarray(frame if from_top else frame[::-1]).view(np.uint8).reshape(rows, -1)
+        images.append(_chunk(b"00db", np.pad(stored, ((0, 0), (0, -stored.shape[1] % 4))).tobytes()))
+    share = -(-count // parts)
+    split = [b"".join(images[at : at + share]) for at in range(0, count, share)]
+    first = _list(b"hdrl", head) + _chunk(b"JUNK", bytes(11)) + _list(b"movi", split[0]) + _chunk(b"idx1", bytes(16))
+    rest = (_list(b"AVIX", _list(b"movi", part), b"RIFF") for part in split[1:])
+    path.write_bytes(b"".join([_list(b"AVI ", first, b"RIFF"), *rest]))
+
+
 def write_b16(path, image, *, comment=b"", extended=True):
     """Write a PCO ``.b16`` image, with the extended header and a comment or with the six basic numbers only.
 
@@ -152,19 +229,31 @@ def _cine_setup(columns, rows, fields):
     setup = bytearray(SETUP_BYTES)
     struct.pack_into("<2sH", setup, 140, b"ST", SETUP_BYTES)
     struct.pack_into("<HH", setup, 737, columns, rows)
-    struct.pack_into("<I", setup, 768, 1000)  # images a second
+    setup[17] = fields.get("TrigFrame", 0)
+    struct.pack_into("<ii", setup, 756, fields.get("bFlipH", 0), fields.get("bFlipV", 0))
+    struct.pack_into("<I", setup, 768, fields.get("rate", 1000))  # images a second
+    struct.pack_into("<i", setup, 884, fields.get("Rotate", 0))
     struct.pack_into("<I", setup, 800, 700)  # version of the software
     struct.pack_into("<I", setup, 808, fields.get("CFA", 0))
     struct.pack_into("<I", setup, 896, fields["RealBPP"])
     return bytes(setup)
 
 
-def _tagged_blocks(count):
-    """Return the blocks of times and exposures of each image."""
-    times = struct.pack(f"<{count}Q", *(number << 20 for number in range(count)))
-    exposures = struct.pack(f"<{count}I", *(1 << 10,) * count)
+def _tagged_blocks(count, interval_s, exposure_s):
+    """Return the blocks of times and exposures of each image, in 2^-32 seconds."""
+    start = 1_700_000_000 << 32
+    times = struct.pack(f"<{count}Q", *(start + round(number * interval_s * 2**32) for number in range(count)))
+    exposures = struct.pack(f"<{count}I", *(round(exposure_s * 2**32),) * count)
     blocks = struct.pack("<IHH", 8 + len(times), 1002, 1) + times
     return blocks + struct.pack("<IHH", 8 + len(exposures), 1003, 0) + exposures
+
+
+def _chunk(name, content):
+    return name + struct.pack("<I", len(content)) + content + bytes(len(content) % 2)
+
+
+def _list(kind, content, name=b"LIST"):
+    return _chunk(name, kind + content)
 
 
 def _mraw_pixels(frame, bits):

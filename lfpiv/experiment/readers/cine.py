@@ -4,17 +4,21 @@ The layout is Vision Research's "Cine File Format". Numbers are stored least byt
 stored from the bottom row, as bitmaps are, unless their height is negative; packed images of 10 and 12 bits from the
 top. Packed 10-bit codes are turned into linear 12-bit counts by the table of that document, which the package
 cine-handler of the extra ``phantom`` holds.
+
+The maker's software shows a recording mirrored or turned where the file says so (``bFlipH``, ``bFlipV``, ``Rotate``),
+though the stored pixels are not. So does this reader.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from lfpiv.experiment.readers.mraw import unpack_12
-from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
+from lfpiv.experiment.readers.source import CannotRead, Header, ImagePath, NotOneImage, Recorded
 from lfpiv.experiment.readers.stack import Frames, read_bytes
 
 PACKED_10, PACKED_12 = 256, 1024
@@ -23,8 +27,14 @@ JPEG, UNINTERPOLATED = 1, 2
 """Values of the file header's ``Compression``; 0 is grey, and the last one is grey too without a colour filter."""
 SETUP_MARK_AT = 140
 """Place of ``Mark`` and ``Length`` in the SETUP structure, whose length depends on the software [byte]."""
-COLOUR_FILTER_AT = 808
-"""Place of ``CFA`` in the SETUP structure [byte]."""
+FLIPS_AT, RATE_AT, COLOUR_FILTER_AT, ROTATE_AT, EXPOSURE_AT = 756, 768, 808, 884, 1568
+"""Places of ``bFlipH`` (``bFlipV`` follows), ``FrameRate``, ``CFA``, ``Rotate`` and ``ShutterNs`` in it [byte]."""
+SYNC_AT = 17
+"""Place of ``TrigFrame``: 0 where the camera's own clock sets the rate [byte]."""
+TIMES, EXPOSURES = 1002, 1003
+"""Types of the blocks with time and exposure of each image, in 2^-32 seconds."""
+MOST_BLOCKS = 100
+"""Largest number of blocks of any type before the images."""
 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIQ")
 _BITMAP_HEADER = struct.Struct("<IiiHHII")
@@ -46,7 +56,10 @@ class Cine(Frames):
             )
         self._top_down = rows < 0 or self._packing != 0
         super().__init__(image.file, (abs(rows), columns), np.dtype("u1" if bits == 8 else "<u2"), count)
-        _require_grey(image, compression, bits, self._packing, setup_at)
+        self._setup = _setup(image, setup_at)
+        self._blocks = _blocks(image, setup_at + len(self._setup), offsets_at) if self._setup else {}
+        _require_grey(compression, bits, self._packing, self._field(COLOUR_FILTER_AT))
+        self._turns = _turns(self._field(ROTATE_AT, "<i"))
         self._offsets_at = offsets_at
         self._offset = struct.Struct("<q" if version else "<I")
         self._require_table()
@@ -65,15 +78,47 @@ class Cine(Frames):
             raise ValueError(f"image {number} has {length} bytes, expected {self._lengths()[0]}")
         return start + annotation, length
 
+    def header(self, number: int) -> Header:
+        """Return the header of an image as it is shown, perhaps turned."""
+        header = super().header(number)
+        return replace(header, shape=header.shape[::-1]) if self._turns % 2 else header
+
     def decode(self, data: bytes) -> np.ndarray:
-        """Return the pixels of an image from their bytes, the upper row first."""
+        """Return the pixels of an image from their bytes, mirrored and turned as the file says."""
         rows, columns = self.shape
         if self._table is not None:
-            return self._table(data).reshape(self.shape)
-        if self._packing == PACKED_12:
-            return unpack_12(data).reshape(self.shape)
-        stored = np.frombuffer(data, self.dtype).reshape(rows, -1)[:, :columns]
-        return stored if self._top_down else stored[::-1]
+            stored = self._table(data).reshape(self.shape)
+        elif self._packing == PACKED_12:
+            stored = unpack_12(data).reshape(self.shape)
+        else:
+            stored = np.frombuffer(data, self.dtype).reshape(rows, -1)[:, :columns]
+        across, down = self._field(FLIPS_AT) != 0, self._field(FLIPS_AT + 4) != 0
+        shown = stored[:: 1 if self._top_down != down else -1, :: -1 if across else 1]
+        return np.rot90(shown, self._turns)
+
+    def recorded(self, number: int) -> Recorded:
+        """Return time and exposure of an image from their blocks, and the interval if the camera's clock set it."""
+        exposure, rate = self._block(EXPOSURES, "<I", number), self._field(RATE_AT)
+        time, first = (self._block(TIMES, "<Q", one) for one in (number, 0))
+        seconds = None if time is None or first is None else (time - first) / 2**32
+        shutter = self._field(EXPOSURE_AT)
+        return Recorded(
+            time_s=seconds,
+            exposure_s=exposure / 2**32 if exposure else shutter * 1e-9 or None,
+            interval_s=1 / rate if rate and self._setup[SYNC_AT] == 0 else None,
+        )
+
+    def _field(self, at: int, form: str = "<I") -> int:
+        """Return a field of the SETUP structure; 0 where the software that wrote it did not know the field."""
+        return int(struct.unpack_from(form, self._setup, at)[0]) if at + 4 <= len(self._setup) else 0
+
+    def _block(self, kind: int, form: str, number: int) -> int | None:
+        """Return the entry of an image in a block; None without such a block."""
+        start, length = self._blocks.get(kind, (0, 0))
+        size = struct.calcsize(form)
+        if length < self.count * size:
+            return None
+        return int(struct.unpack(form, read_bytes(self.file, start + number * size, size))[0])
 
     def _start(self, number: int) -> int:
         """Return the first byte of an image's annotation."""
@@ -95,18 +140,45 @@ class Cine(Frames):
         return (rows * row, rows * (row + -row % 4))
 
 
-def _require_grey(image: ImagePath, compression: int, bits: int, packing: int, setup_at: int) -> None:
+def _setup(image: ImagePath, start: int) -> bytes:
+    """Return the SETUP structure as far as its software wrote it; nothing where it has no mark."""
+    try:
+        mark, length = struct.unpack("<2sH", read_bytes(image.file, start + SETUP_MARK_AT, 4))
+        return read_bytes(image.file, start, length) if mark == b"ST" else b""
+    except ValueError:  # the file ends before
+        return b""
+
+
+def _blocks(image: ImagePath, start: int, end: int) -> dict[int, tuple[int, int]]:
+    """Return first byte and number of bytes of each block between the SETUP structure and the table of images."""
+    found: dict[int, tuple[int, int]] = {}
+    while start + 8 <= end and len(found) < MOST_BLOCKS:
+        try:
+            size, kind, _ = struct.unpack("<IHH", read_bytes(image.file, start, 8))
+        except ValueError:
+            break
+        if size < 8 or start + size > end:
+            break
+        found[kind] = (start + 8, size - 8)
+        start += size
+    return found
+
+
+def _turns(angle_deg: int) -> int:
+    """Return the number of quarter turns counterclockwise by which images are shown."""
+    if angle_deg % 90:
+        raise ValueError(f"images turned by {angle_deg} degrees")
+    return angle_deg // 90 % 4
+
+
+def _require_grey(compression: int, bits: int, packing: int, colour_filter: int) -> None:
     """Refuse recordings of other than single-channel raw counts."""
     if compression == JPEG or packing not in (0, PACKED_10, PACKED_12):
         raise NotOneImage("compressed images; save the recording as raw cine")
     if bits not in (8, 16):
         raise NotOneImage(f"pixels of {bits} bits, such as a colour image; save raw grey values")
-    if compression == UNINTERPOLATED:
-        mark, setup_bytes = struct.unpack("<2sH", read_bytes(image.file, setup_at + SETUP_MARK_AT, 4))
-        if mark == b"ST" and setup_bytes >= COLOUR_FILTER_AT + 4:
-            (colour_filter,) = struct.unpack("<I", read_bytes(image.file, setup_at + COLOUR_FILTER_AT, 4))
-            if colour_filter & 0xFFFFFF:  # the last byte names the sensor head
-                raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
+    if compression == UNINTERPOLATED and colour_filter & 0xFFFFFF:  # the last byte names the sensor head
+        raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
 
 
 def _linear_counts() -> Callable[[bytes], np.ndarray]:

@@ -13,11 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, Recorded
 
+SUFFIXES = (".im7", ".imx")
+"""Suffixes of image files."""
 VECTOR_SUFFIXES = (".vc7", ".vec")
 """Suffixes of vector files."""
 
+UNITS_S = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "\u03bcs": 1e-6, "us": 1e-6, "ns": 1e-9}
+"""Units of time by their signs, of which micro has two [s]."""
+
+_TIME = re.compile(r"(?P<number>-?\d+(\.\d+)?([eE][-+]?\d+)?)\s*(?P<unit>s|ms|[µ\u03bcu]s|ns)")
 _FRAME = re.compile(r"(?:(?P<camera>\d+)\.)?(?P<frame>\d+)")
 
 
@@ -64,13 +70,10 @@ def read(image: ImagePath) -> np.ndarray:
     NotOneImage
         If there is no such frame, or it is not one image of grey values.
     """
-    library = _library()
-    status = image.file.stat()
-    buffer = _buffer(library, str(image.file), status.st_mtime_ns, status.st_size)
-    number = _frame_number(image.part, len(buffer))
-    frame = buffer[number]
+    buffer = _buffer_of(image)
+    frame = buffer[_frame_number(image.part, len(buffer))]
     if "PIXEL" not in frame.components:
-        raise NotOneImage(f"frame {number} without pixels, such as a vector field")
+        raise NotOneImage(f"a frame #{image.part or 0} without pixels, such as a vector field")
     if str(frame.attributes.get("RGBFrame", "0")) != "0":
         raise NotOneImage("pixels behind a colour filter; record with a monochrome camera")
     masked = [int(np.size(mask) - np.count_nonzero(mask)) for mask in frame.masks]  # 1 marks a valid pixel
@@ -84,6 +87,27 @@ def read(image: ImagePath) -> np.ndarray:
     if (scale.slope, scale.offset) == (1.0, 0.0):
         return pixels
     return float(scale.offset) + float(scale.slope) * pixels.astype(float)
+
+
+def recorded(image: ImagePath) -> Recorded:
+    """Return time, exposure and time between the pulses of a frame, from its attributes."""
+    buffer = _buffer_of(image)
+    attributes = buffer[_frame_number(image.part, len(buffer))].attributes
+    time_s, exposure_s, pulses_s = (
+        _seconds(str(attributes.get(name, ""))) for name in ("AcqTimeSeries", "ExposureTime", "FrameDt")
+    )
+    return Recorded(time_s=time_s, exposure_s=exposure_s, pulses_s=pulses_s or None)
+
+
+def _seconds(text: str) -> float | None:
+    """Return the time that a text such as "80 µs" states; None for any other text [s]."""
+    match = _TIME.fullmatch(text.strip())
+    return None if match is None else float(match["number"]) * UNITS_S[match["unit"]]
+
+
+def _buffer_of(image: ImagePath) -> Any:
+    status = image.file.stat()
+    return _buffer(_library(), str(image.file), status.st_mtime_ns, status.st_size)
 
 
 def _library() -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lfpiv.experiment.readers.hdf5_chunks import all_written, read_chunks, require_filters, require_written
 from lfpiv.experiment.readers.limits import require_plausible
-from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage
+from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage, Recorded
 from lfpiv.experiment.readers.stack import OPEN_STACKS, OpenFiles
 
 MOST_LINKS = 16
@@ -137,6 +137,11 @@ def in_order(image: ImagePath) -> bool:
     opened = _open_files.get(image, Hdf5Images)
     dataset, number = opened.find(image.part)
     return number is not None and (dataset.chunks is None or all_written(dataset))
+
+
+def recorded(image: ImagePath) -> Recorded:
+    """Return when an image was recorded: HDF5 has no place of its own for it."""
+    return Recorded()
 
 
 def read(image: ImagePath) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage
+from lfpiv.experiment.readers.source import CannotRead, ImagePath, NotOneImage, Recorded
 from lfpiv.experiment.readers.stack import Frames
 
 HEADER_BYTES = 1 << 20
@@ -22,10 +22,11 @@ _XML_KEYS = {
     "File Format": "fileFormat",
     "Camera Type": "deviceName",
     "Record Rate(fps)": "recordRate",
+    "Save Step": "skipFrame",
 }
 """Elements of the XML header by the keys of the text header."""
-_MODEL = re.compile(r"-([MC])(?![A-Za-z0-9])")
-"""Letter in the name of a camera's model that says monochrome or colour, as in "type 1100K-M-64GB"."""
+_MODEL = re.compile(r"-([MC])\d*(?![A-Za-z0-9])")
+"""Letter in the name of a model that says monochrome or colour, as in "type 1100K-M-64GB" and "model 675K-M3"."""
 
 
 class Mraw(Frames):
@@ -42,12 +43,17 @@ class Mraw(Frames):
         if rows * columns * self._bits % 8:
             raise ValueError(f"{rows} x {columns} pixels of {self._bits} bits do not fill whole bytes")
         self._length = rows * columns * self._bits // 8
+        self._interval_s = _interval_s(header.get("Record Rate(fps)", ""), header.get("Save Step", ""))
         if count * self._length < self.size:
             raise ValueError(f"its header declares {count * self._length} bytes, the file has {self.size}")
 
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of an image's pixels."""
         return number * self._length, self._length
+
+    def recorded(self, number: int) -> Recorded:
+        """Return the time between images, from the rate of recording."""
+        return Recorded(interval_s=self._interval_s)
 
     def decode(self, data: bytes) -> np.ndarray:
         """Return the pixels of an image from their bytes."""
@@ -111,6 +117,16 @@ def _element(text: str, name: str) -> str:
     inside = text.partition(f"<{name}>")[2]
     content, end, _ = inside.partition(f"</{name}>")
     return content.strip() if end else ""
+
+
+def _interval_s(rate: str, step: str) -> float | None:
+    """Return the time between the stored images, of which one in `step` was saved; None where it is not stated [s]."""
+    try:
+        images_per_s = float(rate)
+    except ValueError:
+        return None
+    every = int(step) if step.isascii() and step.isdigit() and len(step) < 10 else 1
+    return max(every, 1) / images_per_s if 1e-3 < images_per_s < 1e9 else None
 
 
 def _number(header: Mapping[str, str], key: str) -> int:

@@ -11,7 +11,7 @@ STACK_SUFFIXES = (".h5", ".hdf5")
 """Suffixes of files whose parts have names with ``/``."""
 SUFFIXES = (
     *(".tif", ".tiff", ".png", ".im7", ".imx", *STACK_SUFFIXES),
-    *(".cine", ".mraw", ".b16", ".raw", ".bin"),
+    *(".cine", ".mraw", ".b16", ".seq", ".avi", ".raw", ".bin"),
 )
 """Suffixes of image files."""
 
@@ -36,6 +36,24 @@ class Header:
     """(rows, columns)."""
     dtype: str
     """Name of the pixel type."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """When an image was recorded, as its file says; None where it does not."""
+
+    time_s: float | None = None
+    """Time after the first image of the recording [s]."""
+    uncertainty_s: float = 0.0
+    """Largest error of a difference of two times [s]."""
+    is_arrival: bool = False
+    """Whether the time is that of storing the image, not of its exposure."""
+    exposure_s: float | None = None
+    """Duration of the exposure [s]."""
+    interval_s: float | None = None
+    """Time between successive images of the file, as the camera was set [s]."""
+    pulses_s: float | None = None
+    """Time between the two pulses of light of a double frame [s]."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from lfpiv.experiment.readers.limits import require_plausible
-from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage
+from lfpiv.experiment.readers.source import Header, ImagePath, NoSuchImage, NotOneImage, Recorded
 
 Opened = TypeVar("Opened")
 
@@ -73,6 +73,10 @@ class Stack(ABC):
     @abstractmethod
     def read(self, number: int) -> np.ndarray:
         """Return the pixels of an image as they are stored, shape (rows, columns)."""
+
+    def recorded(self, number: int) -> Recorded:
+        """Return when an image was recorded, as far as the file says."""
+        return Recorded()
 
     def holds(self, number: int) -> bool:
         """Return whether there is an image of that number."""
@@ -166,6 +170,11 @@ class StackReader:
         """Return the pixels of an image."""
         stack = _stacks.get(image, self.open_file)
         return stack.read(stack.number(image.part))
+
+    def recorded(self, image: ImagePath) -> Recorded:
+        """Return when an image was recorded, as far as the file says."""
+        stack = _stacks.get(image, self.open_file)
+        return stack.recorded(stack.number(image.part))
 
     def in_order(self, image: ImagePath) -> bool:
         """Return whether the images of the file are numbered from 0 without gaps: they are."""

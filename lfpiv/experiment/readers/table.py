@@ -7,12 +7,14 @@ from typing import Protocol
 import numpy as np
 
 from lfpiv.experiment.readers import davis, hdf5
+from lfpiv.experiment.readers.avi import Avi
 from lfpiv.experiment.readers.b16 import B16
 from lfpiv.experiment.readers.cine import Cine
 from lfpiv.experiment.readers.mraw import open_mraw
 from lfpiv.experiment.readers.png import Png
 from lfpiv.experiment.readers.raw import Raw
-from lfpiv.experiment.readers.source import Header, ImagePath
+from lfpiv.experiment.readers.seq import Seq
+from lfpiv.experiment.readers.source import Header, ImagePath, Recorded
 from lfpiv.experiment.readers.stack import StackReader
 from lfpiv.experiment.readers.tiff import TiffStack
 
@@ -25,6 +27,9 @@ class Reader(Protocol):
 
     def in_order(self, image: ImagePath) -> bool:
         """Return whether the images of the file are numbered from 0 without gaps."""
+
+    def recorded(self, image: ImagePath) -> Recorded:
+        """Return when an image was recorded, as far as its file says."""
 
     def read(self, image: ImagePath) -> np.ndarray:
         """Return the pixels of an image [counts], shape (rows, columns), of the stored type."""
@@ -41,6 +46,8 @@ READERS: dict[str, Reader] = {
     ".cine": StackReader(Cine),
     ".mraw": StackReader(open_mraw),
     ".b16": StackReader(B16),
+    ".seq": StackReader(Seq),
+    ".avi": StackReader(Avi),
     ".raw": StackReader(Raw),
     ".bin": StackReader(Raw),
 }
