@@ -1,19 +1,18 @@
 """Benchmark cases: each names an operation, its settings and a scale.
 
 The function of an operation prepares its inputs and returns a `Work`: the timed call, the check of its result, and the
-same work by other software.
+same work by other software. Calls of users are in `calls`.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
-from inputs import explicit, grid, nonzeros, particles, rig
+from inputs import explicit, grid, nonzeros, rig
 from scipy import ndimage, optimize
 from threadpoolctl import threadpool_limits
+from work import BARE_CORRELATION, SHIFT, Work, particles, require
 
 import lfpiv
 from lfpiv.calibration.training import TrainingSettings, train
@@ -44,8 +43,6 @@ PEER_F32, PEER_SMART = 1e-5, 1e-3
 """Largest relative difference from an explicit float32 matrix, of one pass and of ten iterations."""
 BIAS_VOXEL = {8: 0.02, 16: 0.01}
 """Largest bias of the displacement by window edge: the project's goals [voxel]."""
-SHIFT = np.array([0.7, -0.4, 0.3])
-"""Displacement of the particles (z, y, x) [voxel]."""
 LABEL_NOISE = 0.04
 """Noise of the training labels per axis [microlens pitch]."""
 DEMO_VOXEL = 0.5
@@ -53,38 +50,12 @@ DEMO_VOXEL = 0.5
 
 BARE_SMART = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1, "tolerance": 0.0}
 """SMART as the peers do it, in a given number of iterations, whatever the defaults are."""
-BARE_CORRELATION = {"smoothing_voxel": 0.0, "intensity_power": 1.0}
-"""The same of the correlation."""
-
-
-class WrongResult(Exception):
-    """The result is wrong, so its time means nothing."""
-
-
-@dataclass
-class Work:
-    """A prepared case. One sample is one call of `run`."""
-
-    run: Callable[[], object]
-    check: Callable[[object], dict[str, float]]  # raises WrongResult, or returns figures of quality
-    amounts: dict[str, float]  # units of work in one run
-    read_bytes: float = 0  # memory that a run must stream at least: its hardware limit is this over the bandwidth,
-    flops: float = 0  # or this over the floating-point rate, whichever takes longer
-    peers: dict[str, Callable[[], object]] = field(default_factory=dict)  # the same work by other software
-    peer_check: Callable[[object], dict[str, float]] | None = None  # default: check
-    peer_share: float = 1.0  # part of the work that a run of a peer does
 
 
 def prepare(name: str) -> Work:
     """Prepare a case. This is not timed."""
     maker, settings, scale = CASES[name]
     return maker(SCALES[scale], **settings)
-
-
-def require(good: bool, message: str) -> None:
-    """Raise `WrongResult` with a message unless the result is right."""
-    if not good:
-        raise WrongResult(message)
 
 
 def relative(found, expected, limit: float) -> dict[str, float]:

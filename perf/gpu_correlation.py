@@ -17,7 +17,7 @@ from pathlib import Path
 from cases import SCALES, SHIFT
 from gpu_trace import Tracer
 from gpu_traffic import Traffic, Work, count_sectors, trace
-from inputs import particles
+from work import particles
 
 import lfpiv
 from lfpiv_kernels import runtime

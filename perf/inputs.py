@@ -109,17 +109,3 @@ def _rows_of(blocks, first: int, last: int) -> sparse.csr_array:
     data = (level * blocks.scale[first + voxel] * rays.share[ray])[lit]
     index = voxel[lit], rays.pixel[ray[lit]]
     return sparse.csr_array((data, index), shape=(last - first, rays.sensor_shape[0] * rays.sensor_shape[1]))
-
-
-def particles(
-    shape: tuple[int, int, int], shift=0.0, seed: int = 0, *, per_voxel: float = 0.012, sd: float = 0.7
-) -> np.ndarray:
-    """Draw Gaussian particles with a standard deviation `sd` [voxel], moved by `shift`."""
-    rng = np.random.default_rng(seed)
-    at = rng.random((int(per_voxel * np.prod(shape)), 3)) * shape + shift
-    stencil = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    voxel = np.rint(at).astype(int)[:, None] + stencil
-    light = np.exp(-((voxel - at[:, None]) ** 2).sum(-1) / (2 * sd**2))
-    inside = ((voxel >= 0) & (voxel < shape)).all(-1)
-    flat = np.ravel_multi_index(tuple(voxel[inside].T), shape)
-    return np.bincount(flat, light[inside], np.prod(shape)).reshape(shape).astype(np.float32)

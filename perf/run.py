@@ -3,6 +3,7 @@
     python perf/run.py [--case NAME ...] [--small | --all] [--paper] [--device auto]
     python perf/run.py --against COMMIT [--case NAME ...]
 
+A comparison without names takes the most used kernels and all calls of users (`calls`).
 Each case runs in its own process, so that its peak memory is measured. Times are 10th percentiles after a warm-up: wall
 time, and CPU time of all threads. A case with a wrong result prints the reason and no time, and the exit status is 1.
 """
@@ -23,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from work import Work, WrongResult
 
 # before the first import of Taichi: standard output is for JSON
 os.environ.update(ENABLE_TAICHI_HEADER_PRINT="0", TQDM_DISABLE="1")
@@ -33,8 +35,11 @@ SECONDS, FEWEST, MOST, ENOUGH = 4.0, 3, 30, 20.0
 once, without a warm-up."""
 TURNS, SHARE = 8, 0.5
 """Least number of turns of a peer, and our time in each turn as a part of the peer's."""
-ROUNDS, BLOCKS, LEAST_BAND = 30, 5, 0.03
-"""Samples per side of a comparison, blocks of these samples, and least band of ratios without a difference."""
+ROUNDS, BLOCKS, LEAST_BAND, SIDE_SECONDS = 30, 5, 0.03, 20.0
+"""Most samples per side of a comparison, blocks of these samples, least band of ratios without a difference, and time
+per side [s] above which there are fewer samples, at least one a block."""
+CALL = "call_"
+"""Begin of the names of users' calls."""
 COMPARED = ("mapping", "count", "footprint", "project", "back_project", "smart", "correlate_8", "deform", "train")
 
 
@@ -96,10 +101,19 @@ def limits() -> dict[str, float]:
     return {"bytes": 8 * cores * (1 << 24) / read, "flops": 2 * 2048**3 / product}
 
 
-def measure(name: str) -> bool:
-    """Print the metrics of one case. Return whether its result is right."""
+def prepare(name: str) -> Work:
+    """Prepare a case, which is not timed. Cases of calls import public names only, as other commits have them."""
+    if name.startswith(CALL):
+        import calls
+
+        return calls.CALLS[name]()
     import cases
 
+    return cases.prepare(name)
+
+
+def measure(name: str) -> bool:
+    """Print the metrics of one case. Return whether its result is right."""
     from lfpiv.runs.memory import peak_mib
 
     def emit(metric, value, unit="1", **more):
@@ -107,12 +121,12 @@ def measure(name: str) -> bool:
         print(json.dumps(line, default=float), flush=True)
 
     began = peak_mib()
-    work = cases.prepare(name)
+    work = prepare(name)
     try:
         result, wall, cpu, count = low(work.run)
         peak = peak_mib()
         quality = work.check(result)
-    except cases.WrongResult as wrong:
+    except WrongResult as wrong:
         emit("wrong", str(wrong))
         return False
     del result
@@ -132,7 +146,7 @@ def measure(name: str) -> bool:
         try:
             done, ((peer_wall, peer_cpu), (wall, cpu)), ratios = interleaved(work.run, run)
             quality = (work.peer_check or work.check)(done)
-        except cases.WrongResult as wrong:
+        except WrongResult as wrong:
             emit("peer_wrong", str(wrong), peer=peer)
             continue
         share = work.peer_share
@@ -145,37 +159,44 @@ def measure(name: str) -> bool:
 
 def serve(name: str) -> None:
     """Prepare a case and time one run per line of standard input, for `compare`."""
-    import cases
-
     import lfpiv
 
-    work = cases.prepare(name)
+    work = prepare(name)
     work.check(work.run())
-    print("READY", Path(lfpiv.__file__).resolve().parents[1], flush=True)
+    seconds = sample(work.run)[1]
+    print("READY", seconds, Path(lfpiv.__file__).resolve().parents[1], flush=True)
     for _ in sys.stdin:
         print("TIME", *sample(work.run)[1:], flush=True)
+    if name.startswith(CALL):
+        import calls
+
+        calls.remove()
 
 
 def compare(name: str, base: Path, device: str) -> None:
     """Print the ratio of this checkout's time to another's, from interleaved samples of processes theirs, ours, theirs.
 
-    Each checkout runs its own ``perf/cases.py``, because modules may have moved. The largest difference between the two
-    processes of one checkout, block by block, is the band of ratios without a difference.
+    Each checkout runs its own ``perf/cases.py``, because modules may have moved, and the ``perf/calls.py`` of this one.
+    The largest difference between the two processes of one checkout, block by block, is the band of ratios without a
+    difference.
     """
     with contextlib.ExitStack() as stack:
         sides = []
         for tree in (base, ROOT, base):
-            command = [sys.executable, str(tree / "perf" / "run.py"), "--serve", name, "--device", device]
+            place = ROOT if name.startswith(CALL) else tree
+            command = [sys.executable, str(place / "perf" / "run.py"), "--serve", name, "--device", device]
             environment = os.environ | {"PYTHONPATH": str(tree)}
             side = subprocess.Popen(command, env=environment, stdin=-1, stdout=-1, text=True)
-            stack.callback(side.kill)
-            ready = next((line.split(maxsplit=1)[1].strip() for line in side.stdout if line.startswith("READY")), None)
-            if ready != str(tree.resolve()):
+            stack.callback(end, side)
+            ready = next((line.split() for line in side.stdout if line.startswith("READY")), [""])
+            if ready[-1] != str(tree.resolve()):
                 print(json.dumps({"case": name, "metric": "wrong", "value": f"{tree}: no right result from {ready}"}))
                 return
             sides.append(side)
-        times = np.empty((ROUNDS, 3, 2))
-        for turn in range(ROUNDS):
+        seconds = float(ready[1]) if len(ready) > 2 else 0.0  # states before this figure was stated
+        rounds = BLOCKS * int(np.clip(SIDE_SECONDS / max(seconds, 1e-3) / BLOCKS, 1, ROUNDS // BLOCKS))
+        times = np.empty((rounds, 3, 2))
+        for turn in range(rounds):
             for place in np.roll([0, 1, 2], turn):
                 sides[place].stdin.write("go\n")
                 sides[place].stdin.flush()
@@ -189,6 +210,14 @@ def compare(name: str, base: Path, device: str) -> None:
     cpu_ratio = cpu[1] / cpu[::2].mean()
     line = {"case": name, "metric": "ratio", "value": ratio, "band": band, "cpu_ratio": cpu_ratio, "verdict": verdict}
     print(json.dumps(line), flush=True)
+
+
+def end(side: subprocess.Popen) -> None:
+    """Let a process that serves a case finish; it removes what it wrote."""
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        side.stdin.close()
+        side.wait(10)
+    side.kill()
 
 
 def stop(*_: object) -> None:
@@ -234,20 +263,24 @@ def main() -> int:
         runtime.start(given.device)
         return serve(given.serve) or 0 if given.serve else 1 - measure(given.measure)
 
+    from calls import CALLS, FOLDER, simulate
     from cases import CASES
 
     scales = ["paper"] if given.paper and not (given.small or given.all) else ["small"]
     scales += ["medium"] * given.all + ["paper"] * (given.paper and scales != ["paper"])
     names = given.case or [name for scale in scales for name in CASES if name.endswith(f"_{scale}")]
-    unknown = [name for name in names if name not in CASES]
+    unknown = [name for name in names if name not in {**CASES, **CALLS}]
     if unknown:
-        parser.error(f"--case: unknown {', '.join(unknown)}; there are {', '.join(CASES)}")
+        parser.error(f"--case: unknown {', '.join(unknown)}; there are {', '.join([*CASES, *CALLS])}")
     print(json.dumps(machine()), flush=True)
     if given.against:
         signal.signal(signal.SIGTERM, stop)
-        names = given.case or [f"{op}_small" for op in COMPARED]
+        names = given.case or [*(f"{op}_small" for op in COMPARED), *CALLS]
         with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder) / "base"
+            if set(names) & CALLS.keys():
+                simulate(Path(folder))
+                os.environ[FOLDER] = folder
             subprocess.run(
                 ["git", "-C", str(ROOT), "worktree", "add", "--quiet", "--detach", str(tree), given.against], check=True
             )

@@ -98,11 +98,9 @@ def _timed(run: Callable[[], Any]) -> tuple[Any, float]:
 
 def _images(weights, factor: float, shift: float) -> dict[str, np.ndarray]:
     """Return noisy images of the same particles at a place."""
-    import inputs
+    import work
 
-    light = inputs.particles(
-        weights.grid.shape, factor * shift, per_voxel=PER_VOXEL / factor**3, sd=factor * BLOB_VOXEL
-    )
+    light = work.particles(weights.grid.shape, factor * shift, per_voxel=PER_VOXEL / factor**3, sd=factor * BLOB_VOXEL)
     rng = np.random.default_rng(1)
     images = {}
     for name, image in weights(light).items():

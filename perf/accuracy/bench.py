@@ -1,6 +1,6 @@
 """A simulated bench of three misaligned, noisy cameras, and pairs of a ring vortex measured by some of them.
 
-The cases `cameras`, `sweeps` and `choices` share its calibration and their common runs.
+The cases `optics` and `choices` measure on it.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ MISALIGNED = {
 """Nominal and true poses of the cameras. The calibration does not know the true ones."""
 SHARED: dict[str, dict[str, Any]] = {}
 """Tables that all scenes share. The other tables have the simulator's defaults."""
-ONE, TWO, THREE = ("middle",), ("left", "right"), ("left", "middle", "right")
-"""Cameras of a measurement. A single camera looks along z, so that its depth axis is the volume's."""
+TWO = ("left", "right")
+"""Cameras of a measurement."""
 PARTICLE_RAYS = 16_384
 """Rays per particle. It lights some 1,500 pixels, so a pixel receives about ten evenly spread rays."""
 ABOUT_STANDARD_ERROR = "Windows overlap by a half along three axes, so an eighth of the vectors counts as independent."

@@ -1,8 +1,8 @@
-"""Measure the effect of cameras, optics, noise and choices of method, on one page like that of `lfpiv reproduce`.
+"""Measure the effect of optics, choices of method and imperfections, on one page like that of `lfpiv reproduce`.
 
     python perf/accuracy/run.py [CASE ...] --out DIR [--scale small|paper] [--seed N]
 
-Cases: real optics, one to three cameras, seeding and noise, choices of method, imperfect experiments, a time series.
+Cases: real optics, choices of method, imperfect experiments, a time series. Cameras and seeding: `table`.
 All are computed where none is named.
 """
 
@@ -17,7 +17,7 @@ from lfpiv.reproduce.study import SCALES, Study, compute
 ACCURACY = Study(
     title="Beyond the paper",
     about="Cases beyond the paper, on rigs with the same main lens and microlenses, smaller volumes and noisy images",
-    modules={key: key for key in ("optics", "cameras", "sweeps", "choices", "imperfections", "dns_series")},
+    modules={key: key for key in ("optics", "choices", "imperfections", "dns_series")},
 )
 
 

@@ -3,7 +3,6 @@
 import json
 
 import bench
-import cameras
 import choices
 import dns_series
 import imperfect_scenes
@@ -12,7 +11,6 @@ import numpy as np
 import optics
 import pytest
 import run
-import sweeps
 import xarray as xr
 from support.small_run import write_empty_report
 
@@ -21,13 +19,11 @@ from lfpiv.reproduce.study import compute
 
 SEED = 3
 PPM = 0.3
-DIM = 4.0  # counts of a particle's pixels that are little more than the read-out noise of 3
 FEW = ("no_momentum", "ten_iterations", "power_1", "drt", "gaussian_dots")
 RAYS_PITCH = (
     0.08  # the project's bound is 0.015; a board of nine dots in three planes tells less than the published one
 )
 FAILS = 5.0  # DRT's rays through 10 mm of glass at 45 degrees miss by 0.6 pitch, this network's by 0.02
-DEPTH = 2.0  # a single camera's depth error over that of two; 4 to 5 in volumes that hold more vectors
 ROUNDING = 1e-9
 every_row = imperfect_scenes.rows  # replaced by fewer rows while the cases are computed
 ROWS = every_row("small") | {"unknown": imperfect_scenes.Row(label="a key of tomorrow", needs="tomorrow")}
@@ -52,9 +48,6 @@ def tiny(tmp_path_factory):
         (bench.DOTS, (3, 3)),
         (bench.PLANES_MM, (-1.0, 0.0, 1.0)),
         (bench.SENSOR_PX, (560, 640)),
-        (cameras.PPM, (PPM,)),
-        (sweeps.PPM, (PPM,)),
-        (sweeps.COUNTS, (300.0, DIM)),
         (imperfect_scenes.SIZE_MM, (2.4, 2.4, 1.6)),
         (imperfect_scenes.SENSOR_PX, (420, 500)),
         (imperfect_scenes.DOTS, (4, 4)),
@@ -67,7 +60,6 @@ def tiny(tmp_path_factory):
     for module, name, value in (
         (bench, "SHARED", coarse),
         (bench, "PARTICLE_RAYS", 8192),
-        (sweeps, "DEFAULT", pair),
         (choices, "DEFAULT", pair),
         (choices, "CHOICES", {key: choices.CHOICES[key] for key in FEW}),
         (optics, "DEFAULT", pair),
@@ -102,24 +94,6 @@ def test_ray_tracing_fails_through_real_optics_and_the_network_does_not(figures)
     pair = case["pairs"]["window"]
     assert pair["network"]["q"] > pair["drt"]["q"] and pair["truth"]["q"] == pytest.approx(1)
     assert list(case["pairs"]) == ["window"]
-
-
-@pytest.mark.slow
-def test_more_cameras_see_depth(figures):
-    runs = {run["cameras"]: run for run in figures["cameras"]["runs"]}
-    assert set(runs) == {"truth", "one", "two", "three"}
-    assert runs["one"]["q"] < runs["two"]["q"] < runs["three"]["q"] < runs["truth"]["q"]
-    assert runs["one"]["error_axes_voxel"][2] > DEPTH * runs["two"]["error_axes_voxel"][2]
-    assert runs["one"]["elongation"] > runs["two"]["elongation"]
-
-
-@pytest.mark.slow
-def test_noise_costs_quality(figures):
-    bright, dim = figures["sweeps"]["noise"]
-    assert bright["snr"] > dim["snr"] > 0 and bright["electrons"] == pytest.approx(dim["electrons"] * 300 / DIM)
-    assert bright["q"] > dim["q"] and bright["error_voxel"] < dim["error_voxel"]
-    assert bright["saturated"] == 0
-    assert figures["sweeps"]["seeding"][0]["q"] == pytest.approx(bright["q"], abs=ROUNDING)  # one run, shown twice
 
 
 @pytest.mark.slow
@@ -223,7 +197,7 @@ def test_standard_errors_are_those_of_independent_vectors():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["fig10"], "cases: expected some of optics, cameras"), (["--seed", "-1"], "seed: expected")],
+    [(["fig10"], "cases: expected some of optics, choices"), (["--seed", "-1"], "seed: expected")],
 )
 def test_wrong_arguments_are_refused_in_one_line(tmp_path, capsys, arguments, message):
     assert run.main([*arguments, "--out", str(tmp_path / "out")]) == 2
