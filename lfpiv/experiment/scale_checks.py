@@ -3,7 +3,7 @@
 A length typed in metres is a thousandth of what is meant, one in micrometres a thousand times as much. The optics state
 two lengths at the volume: what a microlens covers, the finest detail of a refocused image, and the field of view.
 Volumes have some ten to a thousand microlenses across and are about as large as the field, voxels have 0.1 to 3
-microlenses. The limits are far outside of that: a factor of a thousand exceeds them, and no rig that can measure does.
+microlenses. The limits are outside of that: a factor of a thousand exceeds them, and no rig that can measure does.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ FEWEST_LENSES_ACROSS = 2.0
 """Least length of a volume's longest edge [microlens]. Less holds no window of a correlation."""
 FINEST_VOXEL = 0.1
 """Least edge of a voxel [pixel]. A tenth of what a pixel covers of the volume is finer than any image can show."""
+COARSEST_VOXEL = 5.0
+"""Largest edge of a voxel [microlens]. Particles and the flow between them are lost in larger voxels."""
 LARGEST_VOLUME = 5.0
 """Largest extents of a volume across a camera's view, relative to its field of view; a camera sees 4 % of more."""
 LEAST_DEPTH = 0.5
@@ -47,9 +49,10 @@ def require_scale(path: Path, volume: Volume, board: NominalBoard, cameras: Sequ
     Raises
     ------
     InputError
-        If the volume has less than `FEWEST_LENSES_ACROSS` microlenses, a voxel less than `FINEST_VOXEL` pixels, or the
-        board's planes are nearer than `LEAST_DEPTH` microlenses; if the volume reaches to the main lenses, or is more
-        than `LARGEST_VOLUME` times as large as the field of view, of all cameras.
+        If the volume has less than `FEWEST_LENSES_ACROSS` microlenses, a voxel less than `FINEST_VOXEL` pixels or more
+        than `COARSEST_VOXEL` microlenses, or the board's planes are nearer than `LEAST_DEPTH` microlenses; if the
+        volume reaches to the main lenses, or is more than `LARGEST_VOLUME` times as large as the field of view, of all
+        cameras.
     """
     size = " x ".join(f"{length:g}" for length in volume.size_mm) + " mm"
     finest = min(cameras, key=lambda camera: lens_mm(camera.optics))
@@ -73,6 +76,12 @@ def require_scale(path: Path, volume: Volume, board: NominalBoard, cameras: Sequ
     too_large = [_too_large(volume, camera) for camera in cameras]
     if all(too_large):
         raise InputError(f"{path}: volume.size_mm: expected {too_large[0]}, found {size}. {UNIT}")
+    coarsest = max(lens_mm(camera.optics) for camera in cameras)
+    if volume.voxel_mm > COARSEST_VOXEL * coarsest:
+        raise InputError(
+            f"{path}: volume.voxel_mm: expected voxels of about a microlens, which covers {coarsest:.3g} mm of the "
+            f"volume, found {volume.voxel_mm:g} mm, larger than any particle's image. {UNIT}"
+        )
 
 
 def lens_mm(optics: Optics) -> float:

@@ -96,6 +96,14 @@ def test_voxels_and_planes_in_metres_are_refused(name):
         require_scale(PATH, volume, scaled(board, "planes_mm", by=1e-3), cameras)
 
 
+@pytest.mark.parametrize("name", sorted(set(RIGS) - {"fine voxels", "micro-PIV"}))
+def test_voxels_that_are_ten_times_too_large_are_refused(name):
+    volume, board, cameras = rig(name)
+    assert require_scale(PATH, scaled(volume, "voxel_mm", by=2), board, cameras) is None
+    with pytest.raises(InputError, match=r"volume\.voxel_mm: .*of about a microlens"):
+        require_scale(PATH, scaled(volume, "voxel_mm", by=10), board, cameras)
+
+
 def test_one_camera_with_a_wide_view_suffices():
     volume, board, cameras = rig("sample")
     wide = rig("wind tunnel")[2][0]
