@@ -32,8 +32,10 @@ from lfpiv.lightfield.image_checks import (
     microimage_px,
     stated_px,
 )
+from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
 from lfpiv.warn import SENTENCES, Code, Warning, warn
+from lfpiv.warn.sentences import OTHER_LIGHT, SHIFTED_LIGHT
 
 log = logging.getLogger(__name__)
 
@@ -182,11 +184,15 @@ def check_light(
         figures = {"share": float(saturated[worst]), "path": str(paths[worst])}
         warn(log, Warning(code=Code.BOARD_SATURATED, subject=setup.name, figures=figures))
     plane = len(images) // 2
-    light = gap_light(images[plane] if dark is None else images[plane] - dark, decoder)
-    if light > NO_PLACE:
+    image = images[plane] if dark is None else images[plane] - dark
+    light = gap_light(image, decoder)
+    shift = disagreement(image - np.float32(decoder.background(image)[0]), decoder, misplaced=light > NO_PLACE)
+    if light > NO_PLACE or shift is not None:
+        sentences = [SENTENCES[Code.MISPLACED]] if light > NO_PLACE else []
+        if shift is not None:
+            sentences.append((SHIFTED_LIGHT if "shift_px" in shift else OTHER_LIGHT).format(**shift) + ".")
         raise InputError(
-            f"{paths[plane]}: board.images of camera {setup.name!r}: {SENTENCES[Code.MISPLACED]} "
-            "Are these board images?"
+            f"{paths[plane]}: board.images of camera {setup.name!r}: {' '.join(sentences)} Are these board images?"
         )
     if light > GAP_LIGHT:
         warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[plane])}))

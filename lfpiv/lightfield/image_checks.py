@@ -16,6 +16,7 @@ from scipy import ndimage, special
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
+from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
 from lfpiv.lightfield.saturation import saturated_pixels as saturated_pixels
@@ -217,6 +218,7 @@ def image_warnings(
     camera: str,
     frame: str | None,
     white_level: float | None = None,
+    others: Mapping[str, LightFieldDecoder] | None = None,
 ) -> list[Warning]:
     """Warn of misplaced or saturated light in one image.
 
@@ -232,10 +234,16 @@ def image_warnings(
         Name of the frame in its pair; None for an instant of a series.
     white_level : float, optional
         Value from which on pixels are saturated, where it is known [counts].
+    others : mapping of str to LightFieldDecoder, optional
+        Decoders of the other cameras, whose images this one may be.
     """
     subject = _subject(camera, frame)
     found = []
-    if (between := gap_light(light, decoder)) > GAP_LIGHT:
+    between = gap_light(light, decoder)
+    if (figures := disagreement(light, decoder, others, misplaced=between > NO_PLACE)) is not None:
+        code = Code.SHIFTED if "shift_px" in figures else Code.OTHER_LATTICE
+        found.append(Warning(code=code, subject=subject, figures=figures))
+    elif between > GAP_LIGHT:
         found.append(Warning(code=Code.MISPLACED, subject=subject, figures={"gap_light": between}))
     if (share := saturated_share(raw, white_level)) > SATURATED:
         found.append(Warning(code=Code.SATURATED, subject=subject, figures={"share": share}))
@@ -267,6 +275,16 @@ def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[W
 
 def _subject(camera: str, frame: str | None) -> str:
     return camera if frame is None else f"{camera}, frame {frame}"
+
+
+def misplaced(frames: Iterable[Iterable[Warning]]) -> bool:
+    """Return whether an image certainly does not belong to its camera's white image, by the warnings per frame."""
+    return any(
+        warning.code in (Code.SHIFTED, Code.OTHER_LATTICE)
+        or (warning.code is Code.MISPLACED and float(str(warning.figures.get("gap_light", 0))) > NO_PLACE)
+        for warnings in frames
+        for warning in warnings
+    )
 
 
 def unmeasured(frames: Iterable[Iterable[Warning]], cameras: int) -> bool:

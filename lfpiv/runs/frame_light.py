@@ -92,7 +92,8 @@ def frame_light(
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
-        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label, top)
+        others = {other: one.decoder for other, one in cameras.items() if other != name}
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label, top, others)
     warnings += image_checks.signal_warnings(structure, label)
     if experiment.series is not None:
         warnings = [replace(warning, instants=(frame.number,)) for warning in warnings]
@@ -184,6 +185,8 @@ def _lit_pairs(
             log.debug("light of %s: %s", experiment.name_of(pair), error)
             continue
         if min(min(frame.structure.values()) for frame in light) < NOISE:
+            continue
+        if image_checks.misplaced(frame.warnings for frame in light):
             continue
         yield pair, [dict(frame.images) for frame in light]
         used += 1

@@ -17,6 +17,8 @@ from lfpiv.velocity.cross_correlation import correlate
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
+MISPLACED = "an image does not belong to its camera's white image: none of the vectors counts"
+"""Verdict on the vectors of a pair if the light of an image lies beside the microimages."""
 
 
 def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Experiment) -> xr.Dataset:
@@ -26,16 +28,21 @@ def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Exper
 
 
 def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
-    """Mark all vectors as not valid if fewer than two of several cameras saw particles in a frame."""
+    """Mark all vectors as not valid if an image is misplaced, or too few cameras saw particles in a frame."""
     cameras = len(volumes.records[0].structure)
-    if not image_checks.unmeasured([record.warnings for record in volumes.records], cameras):
+    warnings = [record.warnings for record in volumes.records]
+    if image_checks.misplaced(warnings):
+        verdict = MISPLACED
+    elif image_checks.unmeasured(warnings, cameras):
+        verdict = NO_PARTICLES
+    else:
         return vectors
     valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
     names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
     changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}
     seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
     attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
-    return vectors.assign(changed).assign_attrs(verdict=NO_PARTICLES, **attributes)
+    return vectors.assign(changed).assign_attrs(verdict=verdict, **attributes)
 
 
 def _with_motion(vectors: xr.Dataset, volumes: tuple[xr.DataArray, xr.DataArray]) -> xr.Dataset:

@@ -10,6 +10,8 @@ class Code(enum.Enum):
     """Kind of a warning; the value is stored in files and never changes."""
 
     # images of a pair
+    SHIFTED = "shifted"
+    OTHER_LATTICE = "other_lattice"
     MISPLACED = "misplaced"
     SATURATED = "saturated"
     UNEVEN = "uneven"
@@ -76,7 +78,17 @@ _MISPLACED = (
     "are f_number and microlens_focal_length_mm right?"
 )
 
+SHIFTED_LIGHT = (
+    "light lies {shift_px:.1f} px ({shift_pitch:.2f} microlens pitch) beside the microimages of the white image; {fit}"
+)
+"""Sentence on an image whose light lies beside the microimages."""
+OTHER_LIGHT = "light does not follow the microimages of the white image; {fit}"
+"""Sentence on an image whose light is that of another lattice."""
+_INVALID = ". No vector from this image is valid"
+
 SENTENCES: Mapping[Code, str] = {
+    Code.SHIFTED: SHIFTED_LIGHT + _INVALID,
+    Code.OTHER_LATTICE: OTHER_LIGHT + _INVALID,
     Code.MISPLACED: _MISPLACED,
     Code.SATURATED: (
         "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "

@@ -12,7 +12,7 @@ from support import scenes
 
 import lfpiv
 from lfpiv import statistics
-from lfpiv.lightfield import image_checks
+from lfpiv.lightfield import image_checks, lattice_fit
 from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, dark_blocks, gap_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pair_vectors, pipeline
@@ -23,6 +23,9 @@ CLEAR = GAP_LIGHT / 5  # gap light of a camera's own images; real images gave 0.
 GOOD = 0.02  # [pitch] below every limit that warns
 MAGNIFICATION = 0.002  # ten times the spread over rigs and seeds
 QUARTER_PITCH_PX = 3  # of 12.5
+MIRRORED_PITCH = {"square": 0.4, "hexagonal": np.hypot(0.5, 0.6 - np.sqrt(0.75))}
+"""Distance between the lattice of the second of `OFFSETS_MM` and its picture upside down [pitch]."""
+SHIFT_PX = 0.3  # four times the step at which shifts are read
 OFFSETS_MM = ((0.0, 0.0), (0.05, 0.03))
 """Offsets of the arrays on their sensors: half a pitch and a third of a pitch apart."""
 
@@ -66,6 +69,27 @@ def test_light_between_the_microimages_shows_another_cameras_image(pair_of_camer
     assert gap_light(noise, left) == 0 == gap_light(np.zeros(left.gain.shape), left)
 
 
+def test_the_lattice_of_the_particle_images_shows_what_is_misplaced(pair_of_cameras):
+    """Of its own array an image is not shifted, however weak, uneven or noisy; else shift and remedy are named."""
+    experiment, calibration = pair_of_cameras
+    left, right = (calibration.cameras[name].decoder for name in ("left", "right"))
+    pitch = right.optics.microimage_pitch_px
+    rng = np.random.default_rng(0)
+    for image in (experiment.particle_image("right", 0, "a"), experiment.board_image("right", 0)):
+        light = image - np.float32(right.background(image)[0])
+        pupil = right.pupil_mm[..., 0] / right.optics.pupil_radius_mm
+        for own in (light, 0.02 * light + rng.normal(0, 3, light.shape), light * (1 + 0.5 * pupil), light + 100):
+            assert lattice_fit.disagreement(own.astype(np.float32), right, {"left": left}) is None
+        shifted = lattice_fit.disagreement(np.roll(light, QUARTER_PITCH_PX, axis=1), right, {"left": left})
+        assert abs(shifted["shift_px"] - QUARTER_PITCH_PX) < SHIFT_PX and lattice_fit.MOVED in shifted["fit"]
+        upside_down = lattice_fit.disagreement(light[::-1], right, {"left": left})
+        assert abs(upside_down["shift_pitch"] - MIRRORED_PITCH[right.optics.layout]) < SHIFT_PX / pitch
+        assert "mirrored upside down" in upside_down["fit"]
+        assert "white image of camera right" in lattice_fit.disagreement(light, left, {"right": right})["fit"]
+    noise = rng.normal(0, 4, light.shape).astype(np.float32)
+    assert lattice_fit.disagreement(noise, right, {"left": left}) is None
+
+
 def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     experiment, _ = pair_of_cameras
     first, second = (experiment.particle_image("right", 0, frame) for frame in "ab")
@@ -97,7 +121,7 @@ def test_suspicious_images_are_found(pair_of_cameras):
         return [item.code for item in image_checks.image_warnings(image, image - 40, decoder, "left", "a")]
 
     assert found(first) == found(second) == image_checks.uneven_warnings(first, second, "left") == []
-    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == [Code.MISPLACED]
+    assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == [Code.SHIFTED]
     assert found(np.minimum(first * 40, 4095)) == [Code.SATURATED]
     assert [item.code for item in image_checks.uneven_warnings(first, second * 0.05, "left")] == [Code.UNEVEN]
     images = [(name, image_checks.fingerprint(image)) for name, image in (("one", first), ("other", second))]
@@ -123,6 +147,16 @@ def test_vectors_count_where_two_cameras_show_particles(cameras, empty, unmeasur
         for frame in "ab"
     ]
     assert image_checks.unmeasured(frames, cameras) == unmeasured
+
+
+def test_vectors_do_not_count_where_an_image_is_misplaced():
+    def frames(code, **figures):
+        return [[], [Warning(code=code, subject="left", figures=figures)]]
+
+    assert image_checks.misplaced(frames(Code.SHIFTED, shift_px=3.0, shift_pitch=0.3, fit=""))
+    assert image_checks.misplaced(frames(Code.MISPLACED, gap_light=2 * NO_PLACE))
+    assert not image_checks.misplaced(frames(Code.MISPLACED, gap_light=2 * GAP_LIGHT))
+    assert not image_checks.misplaced(frames(Code.SATURATED, share=1.0))
 
 
 @pytest.fixture(scope="module")
