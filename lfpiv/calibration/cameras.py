@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.calibration import checks
+from lfpiv.calibration import checks, contradictions
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
@@ -39,6 +39,7 @@ from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
 from lfpiv.calibration.training import Training, TrainingSettings, train
 from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
+from lfpiv.experiment import axes
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.progress import StepProgress, part_of
@@ -81,7 +82,11 @@ def calibrate_or_continue(
         for number, setup in enumerate(experiment.cameras):
             step = part_of(whole, 0.75 * number / count, 0.75 * (number + 1) / count)
             measured[setup.name] = measure_or_load(experiment, setup, kept, step)
+        log.info("axes: in the recorded pictures %s; %s", axes.directions(experiment), axes.handedness(experiment))
+        with collected() as about_axes:
+            contradictions.warn_unstated(experiment)
         errors = _fit_board(experiment, measured)
+        errors = replace(errors, warnings=(*about_axes, *errors.warnings))
         cameras = {}
         for number, setup in enumerate(experiment.cameras):
             step = part_of(whole, 0.75 + 0.25 * number / count, 0.75 + 0.25 * (number + 1) / count)

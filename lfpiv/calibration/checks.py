@@ -125,9 +125,11 @@ def check_pupil(
     limit = PUPIL_SCALE if found >= COMPLETE * expected else PUPIL_SCALE_INCOMPLETE
     if not abs(fitted.pupil_scale - 1) <= limit:
         raise InputError(
-            f"{experiment.path}: camera {setup.name!r}: expected dots that a camera of the stated optics can see, "
-            f"found {found} of {expected} dots that would need its pupil scaled by {fitted.pupil_scale:.2f}. Check the "
-            "sign of nominal_angle_deg or nominal_direction, image_flip, and the order and sign of board.planes_mm."
+            f"{experiment.path}: camera {setup.name!r}: the stated rig contradicts the board images. {found} of "
+            f"{expected} dots were found, and their blur at each depth is that of an aperture {fitted.pupil_scale:.2f} "
+            "times as wide as stated. Mirrored pictures or another order of the planes would not explain it: check "
+            "board.planes_mm, board.spacing_mm, focal_length_mm, magnification and f_number, and that the board images "
+            "are of this camera."
         )
 
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from lfpiv.calibration import checks
+from lfpiv.calibration import checks, contradictions
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.planes import Planes
@@ -96,8 +96,10 @@ def measure_or_load(
         log.info("%s: dots measured before, kept", setup.name)
         step(1.0)
         return known
-    with collected() as warnings:
+    with collected(quiet=True) as warnings:  # a mistake in the stated rig would explain them
         found = _measure_camera(experiment, setup, step)
+    for warning in warnings:
+        log.warning("%s", warning.sentence)
     found = replace(found, warnings=tuple(warnings))
     if kept is not None:
         kept.keep(found.as_camera(setup))
@@ -107,8 +109,21 @@ def measure_or_load(
 def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> Measured:
     sensor = decode(experiment, setup)
     step(0.2)
-    dots = _measure_dots(experiment, setup, sensor.decoder, step)
-    lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    board, dark = experiment.board, experiment.dark(setup.name)
+    images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
+    checks.check_light(experiment, setup, sensor.decoder, images, dark)
+
+    def cause() -> str | None:
+        with collected(quiet=True):
+            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder)
+
+    try:
+        dots = _measure_dots(experiment, setup, sensor.decoder, images)
+        lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    except InputError as error:
+        raise InputError(cause() or str(error)) from None
+    if contradictions.doubtful(setup, dots, lens) and (text := cause()):
+        raise InputError(text)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens)
 
@@ -144,12 +159,9 @@ def decode(experiment: Experiment, setup: CameraSetup) -> Sensor:
 
 
 def _measure_dots(
-    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, step: StepProgress
+    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, images: Sequence[np.ndarray]
 ) -> BoardDots:
     board, dark = experiment.board, experiment.dark(setup.name)
-    images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
-    checks.check_light(experiment, setup, decoder, images, dark)
-    step(0.2)
     place = f"{experiment.path}: board.images of camera {setup.name!r}"
     with input_errors(place):
         try:

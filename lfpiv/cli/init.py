@@ -139,8 +139,9 @@ QUESTIONS = (
         key="image_flip",
         option="--image-flip",
         form="none, horizontal, vertical or both",
-        text="pictures show the scene mirrored (none), as it is seen (horizontal), or upside down (vertical)",
-        default="none",
+        text="pictures show the scene as it is seen (horizontal), upside down (vertical), mirrored left to right "
+        "(none), or mirrored and upside down (both)",
+        default="horizontal",
     ),
     Question(
         key="white_image",

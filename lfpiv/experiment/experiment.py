@@ -34,7 +34,7 @@ class CameraSetup:
     """Nominal orientation; it numbers the board's dots and enters the thin-lens mapping, never the network. None where
     the board's mark does."""
     image_flip: str
-    """Mirroring of the camera's images, reversed on reading."""
+    """Mirroring that is reversed on reading, so that +x is on the left and +y is up in what is read."""
     white_path: Path
     dark_path: Path | None
     background: str | None = None
@@ -43,6 +43,8 @@ class CameraSetup:
     """Layout of the camera's files without a header, or None."""
     white_level: float | None = None
     """Value from which on pixels are saturated [counts]; None where the images show it."""
+    stated_flip: str | None = None
+    """The key ``image_flip``, or None where it is absent."""
 
     def cells(self) -> tuple[str, ...]:
         """Return the camera's row in the card of its experiment."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import images, nominal_checks, recorded, scale_checks
+from lfpiv.experiment import axes, images, nominal_checks, recorded, scale_checks
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
 from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.patterns import check_length, check_pattern
@@ -69,7 +69,7 @@ def read_experiment(path: str | Path) -> Experiment:
     table = _read_table(path)
     check_tables(path, table)
     board, particles = table.board, table.particles
-    cameras = tuple(_camera(path, camera) for camera in table.camera)
+    cameras = tuple(_camera(path, camera, table.board.axes) for camera in table.camera)
     scale_checks.require_scale(path, table.volume, board, cameras)
     grid = grid_of(path, table)
     experiment = Experiment(
@@ -278,7 +278,7 @@ def _check_windows(path: Path, correlation: Correlation, grid: Grid) -> None:
                 )
 
 
-def _camera(path: Path, table: CameraTable) -> CameraSetup:
+def _camera(path: Path, table: CameraTable, handedness: str) -> CameraSetup:
     key = f"camera {table.name!r}"
     for name in ("white_image", "dark_image"):
         if (image := getattr(table, name)) is not None:
@@ -291,7 +291,8 @@ def _camera(path: Path, table: CameraTable) -> CameraSetup:
         name=table.name,
         optics=optics,
         orientation=table.orientation,
-        image_flip=table.image_flip,
+        image_flip=axes.flip_on_reading(table.image_flip, handedness),
+        stated_flip=table.image_flip,
         white_path=white_path,
         dark_path=None if table.dark_image is None else path.parent / table.dark_image,
         background=table.background_image,

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from lfpiv.experiment.axes import ORDINARY
 from lfpiv.settings.bounds import (
     Coordinate,
     Count,
@@ -23,7 +24,7 @@ from lfpiv.settings.bounds import (
     PathText,
     PixelPitch,
 )
-from lfpiv.settings.rig import Dots
+from lfpiv.settings.rig import Dots, Flip
 from lfpiv.settings.table import Table
 
 COMMENT_COLUMN = 45
@@ -44,7 +45,7 @@ class Values(Table):
     microlens_focal_length_mm: FocalLength
     microlens_layout: Literal["square", "hexagonal"] = "square"
     pixel_um: PixelPitch
-    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
+    image_flip: Flip = ORDINARY
     white_image: PathText
     """Path with ``{camera}``."""
     board_images: PathText
@@ -96,10 +97,8 @@ def _camera(values: Values, name: str, angle: float) -> str:
             _row("microlens_layout", values.microlens_layout, '"square" or "hexagonal"'),
             _row("pixel_um", values.pixel_um, "pixel pitch [um]: data sheet of the camera"),
             _row("nominal_angle_deg", angle, "about y, to 10 degrees, positive on the side of +x"),
-            _row(
-                "image_flip", values.image_flip, '"horizontal" if pictures show the scene as it is seen, "vertical" if'
-            ),
-            " " * COMMENT_COLUMN + '# upside down, "none" if mirrored left to right, "both" if both',
+            _row("image_flip", values.image_flip, '"horizontal": pictures show the scene as it is seen; "vertical":'),
+            " " * COMMENT_COLUMN + '# upside down; "none": mirrored left to right; "both": both',
             "",
         ]
     )

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from lfpiv.experiment import axes
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.prompt import movement
 from lfpiv.quantities import quantity
@@ -27,7 +28,8 @@ def head(experiment: Experiment) -> str:
     return f'<h1 id="top">{markup.escape(experiment.name)}</h1>' + markup.paragraph(
         f"Light-field PIV with {markup.count(len(experiment.cameras), 'camera')}, {size} mm (x, y, z), "
         f"{quantity(experiment.dt_s, 's')} {apart}. One voxel of {voxel:g} mm is "
-        f"{quantity(voxel / 1000 / experiment.dt_s, 'm/s')}.",
+        f"{quantity(voxel / 1000 / experiment.dt_s, 'm/s')}. "
+        f"In the recorded pictures {axes.directions(experiment)}; {axes.handedness(experiment)}.",
         "quiet",
     )
 
@@ -100,7 +102,6 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
             f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm"
             + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
-        ("Axes", _axes(experiment)),
         _recorded(experiment, summary.finished_count),
         ("Motion passes", _motion(summary)),
         ("Weights", _weights(summary.weights)),
@@ -147,17 +148,6 @@ def _recorded(experiment: Experiment, finished: int) -> tuple[str, str]:
 
 def _orientation(camera: CameraSetup) -> str:
     return " in any orientation" if camera.orientation is None else f" {camera.orientation}".replace("-", "−")
-
-
-def _axes(experiment: Experiment) -> str:
-    """State when x, y, z are right-handed: images alone do not show it, see ``docs/conventions.md``."""
-    mirrored = {camera.name: camera.image_flip in ("none", "both") for camera in experiment.cameras}
-    words = {True: "are mirrored, as through one mirror", False: "show the scene as it is, not mirrored"}
-    if len(set(mirrored.values())) == 1:
-        condition = f"the recorded pictures {words[mirrored[experiment.cameras[0].name]]}"
-    else:
-        condition = ", ".join(f"those of {name} {words[state]}" for name, state in mirrored.items())
-    return f"right-handed if {condition}; otherwise left-handed, and vorticity has the other sign"
 
 
 def _motion(summary: Summary) -> str:

@@ -62,7 +62,7 @@ def _of_cameras(experiment: Experiment, cameras: Sequence[CameraSetup]) -> Stamp
         {
             "version": __version__,
             "camera": stated,
-            "board": experiment.board.model_dump(exclude=None if experiment.board.mark else {"mark"}),
+            "board": experiment.board.model_dump(exclude={"axes"} if experiment.board.mark else {"axes", "mark"}),
             "network": experiment.network.model_dump(),
             "images": content_hash(experiment.calibration_images(cameras)),
         }

@@ -25,6 +25,9 @@ from lfpiv.settings.table import Table
 TURNS = 8
 """Turns and mirrors of a square grid."""
 
+Flip = Literal["none", "horizontal", "vertical", "both"]
+"""Orientation of recorded pictures: "horizontal" is an ordinary camera's, which are upright and not mirrored."""
+
 
 class NominalCamera(Table):
     """Nominal keys of ``[[camera]]``, in experiments and in scenes of the simulator."""
@@ -53,8 +56,6 @@ class NominalCamera(Table):
     picture are normal to the world's y axis; a camera straight above or below has x along its rows."""
     nominal_roll_deg: Annotated[float, Field(strict=True, ge=-180, le=180)] = 0.0
     """Rotation of the camera about its viewing axis, clockwise as seen from behind the camera [degree]."""
-    image_flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    """Mirroring of the camera's images."""
 
     @model_validator(mode="after")
     def _one_orientation(self) -> NominalCamera:
@@ -139,6 +140,9 @@ class CameraTable(NominalCamera):
     white_level: Positive | None = None
     """Value from which on pixels are saturated, such as the white level in a camera's header [count]; absent: the
     value at which the pixels of an image pile up."""
+    image_flip: Flip | None = None
+    """How pictures show the scene: "horizontal" as it is seen (an ordinary camera), "vertical" upside down, "none"
+    mirrored left to right, "both" mirrored and upside down; absent: read as "none" where the board agrees."""
     raw: RawImages | None = None
     """Layout of the camera's files without a header; absent: it has none."""
 
@@ -202,6 +206,9 @@ class Board(NominalBoard):
 
     images: PathText
     """Path of the board images with ``{camera}`` and ``{plane}``; planes count from 0."""
+    axes: Literal["right-handed", "left-handed"] = "right-handed"
+    """Handedness of x, y, z. "left-handed" says that x is meant to point left where y is up and z points to the
+    cameras."""
 
     @field_validator("planes_mm")
     @classmethod

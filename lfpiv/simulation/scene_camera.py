@@ -12,7 +12,7 @@ from lfpiv.geometry.optics import LensLattice, Optics
 from lfpiv.geometry.orientation import Orientation, camera_rotation
 from lfpiv.settings import bounds
 from lfpiv.settings.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
-from lfpiv.settings.rig import NominalCamera
+from lfpiv.settings.rig import Flip, NominalCamera
 from lfpiv.settings.table import Table
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
@@ -128,6 +128,8 @@ class SceneCamera(NominalCamera):
     """Columns of the sensor."""
     sensor_height_px: Side
     """Rows of the sensor."""
+    image_flip: Flip = "none"
+    """How pictures show the scene: "none" mirrored left to right, "horizontal" as it is seen."""
     true_yaw_deg: Angle | None = None
     """True camera angle about y, or with `nominal_direction` the departure from it, about the camera's y axis [degree];
     absent: as stated."""

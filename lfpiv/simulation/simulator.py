@@ -284,8 +284,7 @@ def _experiment_text(scene: Scene) -> str:
         if scene.background is not None:
             frame = "_{frame}" if scene.particles.instants is None else ""
             known["background_image"] = f"background/{camera.name}{frame}.tif"
-        if camera.image_flip != "none":
-            known["image_flip"] = camera.image_flip
+        known["image_flip"] = camera.image_flip
         optics = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
         for key in (*optics, "pixel_um", "microlens_layout", "nominal_angle_deg", "nominal_direction"):
             known[key] = getattr(camera, key)

@@ -295,10 +295,15 @@ _collected: ContextVar[list[Warning] | None] = ContextVar("collected", default=N
 
 def warn(log: logging.Logger, warning: Warning) -> None:
     """Log a warning, and hand it to the innermost `collected` block, once."""
-    log.warning("%s", warning.sentence)
     found = _collected.get()
+    if not isinstance(found, _Quiet):
+        log.warning("%s", warning.sentence)
     if found is not None and warning not in found:
         found.append(warning)
+
+
+class _Quiet(list[Warning]):
+    """Warnings that are collected and not logged."""
 
 
 @dataclass(frozen=True)
@@ -318,9 +323,12 @@ class FirstOfEachCode:
 
 
 @contextlib.contextmanager
-def collected() -> Iterator[list[Warning]]:
-    """Collect the warnings of a block in a list, at any log level. A block inside another one has its own list."""
-    found: list[Warning] = []
+def collected(quiet: bool = False) -> Iterator[list[Warning]]:
+    """Collect the warnings of a block in a list, at any log level. A block inside another one has its own list.
+
+    With `quiet` they are not logged.
+    """
+    found: list[Warning] = _Quiet() if quiet else []
     token = _collected.set(found)
     try:
         yield found

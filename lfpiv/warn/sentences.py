@@ -31,6 +31,7 @@ class Code(enum.Enum):
     BOARD_EDGE_UNSEEN = "board_edge_unseen"
     DOT_WIDTH = "dot_width"
     DOTS_MISSING = "dots_missing"
+    FLIP_UNSTATED = "flip_unstated"
     PLANE_EMPTY = "plane_empty"
     PLANE_LEFT_OUT = "plane_left_out"
     PLANE_OFF = "plane_off"
@@ -137,6 +138,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.DOTS_MISSING: (
         "only {found} of {expected} board dots in the field were found; check focus, exposure and the planes listed "
         "in the report.{hint}"
+    ),
+    Code.FLIP_UNSTATED: (
+        "image_flip is not stated, and cameras along the depth axis do not show whether pictures are mirrored: the "
+        "pictures of {cameras} are read as mirrored left to right, so x points left in them. Set image_flip = "
+        '"horizontal" if they show the scene as it is seen, "none" if they are mirrored'
     ),
     Code.PLANE_EMPTY: (
         "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the "

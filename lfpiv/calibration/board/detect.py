@@ -215,6 +215,8 @@ class PlaneDots:
     """Their chief rays on the array [mm], shape (d, 2)."""
     contrast: float
     """Sum of their contrasts."""
+    light: float
+    """The same in shares of the white image's light, so that planes can be compared."""
 
 
 def find_in_planes(
@@ -231,7 +233,8 @@ def find_in_planes(
         if not on_lattice(found - sites[site, :2], sites[site, :2], board, rectified.bin_mm):
             site, found = site[:0], found[:0]
         at = np.column_stack([found, np.full(len(site), z_mm)])
-        seen[plane] = PlaneDots(site, pose.rays(at)[0], float(blobs.contrast[site].sum()))
+        contrast = float(blobs.contrast[site].sum())
+        seen[plane] = PlaneDots(site, pose.rays(at)[0], contrast, contrast * rectified.noise)
         points = np.concatenate([board.points_mm(p, MARGIN)[dots.site] for p, dots in seen.items()])
         pose = pose.fitted(points, np.concatenate([dots.chief_mm for dots in seen.values()]), optics)
     return [seen[plane] for plane in range(len(seen))], pose

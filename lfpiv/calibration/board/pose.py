@@ -154,6 +154,8 @@ class Rectified:
     """Board position (x, y) of element (0, 0) [mm]."""
     bin_mm: float
     """Spacing of the elements [mm]."""
+    noise: float
+    """Standard deviation of the response, in shares of the white image's light."""
 
     def peaks(self, radius_mm: float, sign: int) -> Blobs:
         """Return the significant blobs, at most one within `radius_mm`; `sign` is -1 for dark ones."""
@@ -240,4 +242,4 @@ class Rectifier:
         response[lit] = narrow[0][lit] / narrow[1][lit] - wide[0][lit] / wide[1][lit]
         response *= np.sqrt(narrow[1] / np.median(narrow[1][lit])) if lit.any() else 0  # noise falls with the light
         noise = NORMAL_MAD * np.median(np.abs(response[lit])) if lit.any() else 0.0
-        return Rectified(response / max(noise, 1e-12), corner, bin_mm)
+        return Rectified(response / max(noise, 1e-12), corner, bin_mm, noise)

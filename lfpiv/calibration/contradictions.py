@@ -1,0 +1,193 @@
+"""Say why the board images of the cameras contradict the stated rig: try likely mistakes, and name the fitting one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from itertools import combinations
+
+import numpy as np
+
+from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely_mistake, mistakes, turn_deg
+from lfpiv.calibration.board.planes import Planes, Signals
+from lfpiv.calibration.thin_lens_model import ThinLensModel
+from lfpiv.experiment.axes import MIRRORED, UPSIDE_DOWN, names_of, stated_for
+from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.image_checks import gap_light
+from lfpiv.warn import Code, Warning, warn
+
+log = logging.getLogger(__name__)
+
+COMPLETE = 0.9
+"""Part of the expected dots that a complete board shows."""
+PUPIL_SCALE = 0.05
+"""Difference of the fitted pupil scale from 1 above which depth and defocus of the dots may contradict each other."""
+FITTED_PITCH = 0.1
+"""Median residual of the thin lens up to which its pupil contradicts nothing, as behind a liquid [microlens pitch]."""
+NEARER_DEG = 10.0
+"""Angle by which the fitted pose must be nearer to a mirror image of the stated one than to itself [degree]."""
+OTHER_ARRAY = 0.5
+"""Light between the microimages of another camera's white image, relative to that of the own one, below which board
+images belong to the other camera."""
+
+Decoders = Callable[[CameraSetup], LightFieldDecoder]
+
+
+def doubtful(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel) -> bool:
+    """Return whether the dots of a camera may contradict its stated orientation or the order of the planes.
+
+    Likely mistakes are then tried, which takes seconds. So a right camera may be doubtful.
+    """
+    stated = setup.orientation
+    if stated is None:
+        return False
+    misfit = np.median(np.linalg.norm(dots.array_mm - lens(dots.points_mm, dots.pupil_mm), axis=1))
+    if misfit > FITTED_PITCH * setup.optics.microlens_pitch_mm and abs(lens.pupil_scale - 1) > PUPIL_SCALE:
+        return True
+    if dots.found.sum() < COMPLETE * dots.expected.sum():
+        return True
+    nearer = turn_deg(lens.rotation, stated.rotation) - NEARER_DEG
+    mirrors = (Mistake(left_right=True).mirror, Mistake(up_down=True).mirror)
+    return any(turn_deg(lens.rotation, mirror @ stated.rotation) < nearer for mirror in mirrors)
+
+
+def warn_unstated(experiment: Experiment) -> None:
+    """Warn where neither the experiment file nor a camera at an angle says whether pictures are mirrored."""
+    cameras = experiment.cameras
+    shown = (
+        setup.stated_flip is not None
+        or setup.orientation is None
+        or Mistake(left_right=True) in mistakes(setup.orientation, ())
+        for setup in cameras
+    )
+    if not (experiment.board.mark or any(shown)):
+        figures = {"cameras": names_of([setup.name for setup in cameras])}
+        warn(log, Warning(code=Code.FLIP_UNSTATED, figures=figures))
+
+
+def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
+    """Return what explains the board images of all cameras better than the stated rig, as a message; None if nothing.
+
+    A board with a mark names its dots by itself and is left out.
+    """
+    if experiment.board.mark:
+        return None
+    board = DotBoard.from_settings(experiment.board)
+    found: dict[str, Mistake] = {}
+    decoders = {}
+    for setup in experiment.cameras:
+        if setup.orientation is None:
+            continue
+        decoders[setup.name] = decoder = decoder_of(setup)
+        images = Planes(lambda plane, name=setup.name: experiment.board_image(name, plane), len(board.planes_mm))  # type: ignore[misc]
+        signals = Signals.from_images(images, decoder, experiment.dark(setup.name))
+        mistake = likely_mistake(signals, decoder, board, setup.orientation)
+        if mistake is not None and mistake != RIGHT:
+            found[setup.name] = mistake
+    if not found:
+        return None
+    sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]
+    return f"{experiment.path}: " + " ".join(sentence for sentence in sentences if sentence)
+
+
+def _exchanged(experiment: Experiment, found: Mapping[str, Mistake], decoders: Mapping[str, LightFieldDecoder]) -> str:
+    """Name two cameras whose board images fit the white image of the other one; "" if there are none."""
+    middle = len(experiment.board.planes_mm) // 2
+    for first, second in combinations(found, 2):
+        if decoders[first].optics.sensor_shape != decoders[second].optics.sensor_shape:
+            continue
+        light = np.array(
+            [
+                [gap_light(experiment.board_image(board, middle), decoders[white]) for white in (first, second)]
+                for board in (first, second)
+            ]
+        )
+        if light[0, 1] < OTHER_ARRAY * light[0, 0] and light[1, 0] < OTHER_ARRAY * light[1, 1]:
+            return (
+                f"board.images: those of camera {first!r} fit the microlenses in the white image of camera {second!r}, "
+                f"and the reverse. Exchange the board images of {first!r} and {second!r}, or their white images."
+            )
+    return ""
+
+
+def _planes(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
+    """Name planes whose depths are stated in another order or with another sign; "" if there are none."""
+    names = [name for name, mistake in found.items() if mistake.planes]
+    if not names:
+        return ""
+    if len(names) < len(experiment.cameras):
+        return (
+            f"board.images: those of {_cameras(names)} are in the reverse order of board.planes_mm, and those of the "
+            "other cameras are not. Name the files in the order of the planes."
+        )
+    depths = ", ".join(f"{z:g}" for z in found[names[0]].depths_mm(experiment.board.planes_mm))
+    return (
+        "board.planes_mm: expected the depths in the order of the images, z growing towards the cameras; the dots are "
+        f"in focus in another order. Set planes_mm = [{depths}]."
+    )
+
+
+def _mirrors(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
+    """Name cameras whose pictures lie otherwise than stated, with the remedy; "" if there are none."""
+    sentences = []
+    for left_right, up_down in ((True, False), (False, True), (True, True)):
+        names = [name for name, one in found.items() if (one.left_right, one.up_down) == (left_right, up_down)]
+        if names:
+            what = "upside down" if up_down and not left_right else "mirrored left to right"
+            what = "turned by 180 degrees" if left_right and up_down else what
+            sentences.append(_remedy(experiment, names, what, _flips(experiment, names, left_right, up_down)))
+    return " ".join(sentences)
+
+
+def _flips(experiment: Experiment, names: list[str], left_right: bool, up_down: bool) -> str:
+    """Return the values of ``image_flip`` that reverse what the pictures of some cameras show."""
+    values: dict[str, list[str]] = {}
+    for name in names:
+        flip = experiment.camera(name).image_flip
+        flip = MIRRORED[flip] if left_right else flip
+        flip = UPSIDE_DOWN[flip] if up_down else flip
+        values.setdefault(stated_for(flip, experiment.board.axes), []).append(name)
+    return " and ".join(f'image_flip = "{flip}" for {_cameras(whose)}' for flip, whose in values.items())
+
+
+def _remedy(experiment: Experiment, names: list[str], what: str, flips: str) -> str:
+    """Say what the pictures of some cameras look like, and what to set. `flips` are the values that fit."""
+    others = [camera.name for camera in experiment.cameras if camera.name not in names]
+    key = _key(experiment, names)
+    unlike = f", unlike those of {_cameras(others)}" if others else ""
+    flips_stated = sorted({str(experiment.camera(name).stated_flip) for name in names})
+    stated = ", ".join("image_flip is absent" if flip == "None" else f'image_flip = "{flip}"' for flip in flips_stated)
+    seen = f"the pictures of {_cameras(names)} are {what} against what is stated ({stated}){unlike}."
+    if others and _same_place(experiment, names, others):
+        return f"{seen} Change the sign of {key} of {_cameras(names)}, or set {flips}."
+    ordinary = {experiment.camera(name).stated_flip for name in names} <= {"horizontal", "vertical"}
+    if what == "mirrored left to right" and not others and ordinary:
+        other = "right-handed" if experiment.board.axes == "left-handed" else "left-handed"
+        return (
+            f"{seen} Change the sign of {key} of {_cameras(names)}: it is positive on the side of +x, and x points to "
+            f"the right as the cameras see it. Where a mirror is in the way, set {flips} instead; where x is meant to "
+            f'point the other way, board.axes = "{other}".'
+        )
+    return f"{seen} Set {flips}. If the pictures do lie as stated, {key} has the wrong sign. Compare: lfpiv check."
+
+
+def _same_place(experiment: Experiment, names: list[str], others: list[str]) -> bool:
+    """Return whether one of some cameras is stated to stand where one of the others does."""
+    stated = [[experiment.camera(name).orientation for name in some] for some in (names, others)]
+    return any(
+        np.degrees(np.arccos(np.clip(one.rotation[2] @ other.rotation[2], -1, 1))) < ALIKE_DEG
+        for one in stated[0]
+        for other in stated[1]
+        if one is not None and other is not None
+    )
+
+
+def _key(experiment: Experiment, names: list[str]) -> str:
+    stated = [experiment.camera(name).orientation for name in names]
+    return "nominal_direction" if any(one is not None and one.pitch_deg for one in stated) else "nominal_angle_deg"
+
+
+def _cameras(names: list[str]) -> str:
+    return f"camera {names_of(names)}" if len(names) == 1 else f"cameras {names_of(names)}"
