@@ -10,7 +10,7 @@ import numpy as np
 
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely_mistake, mistakes, turn_deg
-from lfpiv.calibration.board.planes import Planes, Signals
+from lfpiv.calibration.board.planes import Signals, board_images
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.experiment.axes import MIRRORED, UPSIDE_DOWN, names_of, stated_for
 from lfpiv.experiment.experiment import CameraSetup, Experiment
@@ -81,8 +81,7 @@ def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
         if setup.orientation is None:
             continue
         decoders[setup.name] = decoder = decoder_of(setup)
-        images = Planes(lambda plane, name=setup.name: experiment.board_image(name, plane), len(board.planes_mm))  # type: ignore[misc]
-        signals = Signals.from_images(images, decoder, experiment.dark(setup.name))
+        signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
         mistake = likely_mistake(signals, decoder, board, setup.orientation)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake

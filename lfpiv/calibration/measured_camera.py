@@ -16,7 +16,7 @@ import numpy as np
 from lfpiv.calibration import checks, contradictions
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
-from lfpiv.calibration.board.planes import Planes
+from lfpiv.calibration.board.planes import board_images
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens
@@ -109,8 +109,7 @@ def measure_or_load(
 def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> Measured:
     sensor = decode(experiment, setup)
     step(0.2)
-    board, dark = experiment.board, experiment.dark(setup.name)
-    images = Planes(lambda plane: experiment.board_image(setup.name, plane), len(board.planes_mm))
+    dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
     checks.check_light(experiment, setup, sensor.decoder, images, dark)
 
     def cause() -> str | None:

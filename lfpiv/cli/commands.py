@@ -203,6 +203,22 @@ def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> N
     _output.show(summary, lambda: terminal.print_calibration(summary))
 
 
+@_command("check", "lfpiv check experiment.toml --out results")
+def _check(experiment: ExperimentFile, out: Out) -> None:
+    """Draw the board as each camera shows it, with arrows along x and y, to be compared with the real board.
+
+    DIR/check/board.png is drawn before the first run, without particle images. Contradictions of the board and the
+    stated rig end it with exit status 2.
+    """
+    with _output.progress() as progress:
+        from lfpiv.runs.check import check
+
+        found = check(experiment, out, progress=progress)
+    _output.show(found, lambda: terminal.print_check(found))
+    if found["contradiction"]:
+        raise InputError(found["contradiction"])
+
+
 @_command("preview", "lfpiv preview experiment.toml --out results", "lfpiv preview experiment.toml -o results --pair 7")
 def _preview(
     experiment: ExperimentFile,

@@ -185,6 +185,12 @@ def print_init(experiment: Path, written: Written) -> None:
     say(f"next: lfpiv run {experiment} --out results")
 
 
+def print_check(found: dict[str, Any]) -> None:
+    """Print where x and y point, and the picture of the board that shows it."""
+    say(f"axes: {found['axes']}")
+    say(f"compare with the real board: {found['picture']}")
+
+
 def print_preview(found: dict[str, Any]) -> None:
     """Print the light of each camera and frame, the warnings about the images, and the path of the picture."""
     for level in found["levels"]:

@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import lfpiv
 from lfpiv import warn
-from lfpiv.calibration import checks, coverage
+from lfpiv.calibration import checks, contradictions, coverage
+from lfpiv.calibration.board import hypotheses
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.coverage import warn_outside
 from lfpiv.calibration.thin_lens_model import thin_lens_model
@@ -150,18 +151,67 @@ def test_a_wrongly_named_dot_is_left_out(rig):
     assert (agreeing_dots(dots, departure, 0.1) == ~wrong).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mistake", ["planes", "angle"])
-def test_a_board_that_no_such_camera_can_see_is_refused(rig, mistake):
-    experiment, _, _ = rig
+MISTAKES = {
+    "planes": r"Set planes_mm = \[-",
+    "angle": r'cameras? .only. are mirrored left to right .*Set image_flip = "horizontal"',
+    "ordinary": r'Change the sign of nominal_angle_deg .*where x is meant.*board.axes = "left-handed"',
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
+    experiment, _, calibration = rig
+    board, camera = experiment.board, experiment.cameras[0]
+    turned = Orientation(-camera.orientation.yaw_deg)
     if mistake == "planes":
-        board = experiment.board.model_copy(update={"planes_mm": tuple(-z for z in experiment.board.planes_mm)})
-        wrong = dataclasses.replace(experiment, board=board)
-    else:
-        camera = dataclasses.replace(experiment.cameras[0], orientation=Orientation(30.0))
-        wrong = dataclasses.replace(experiment, cameras=(camera,))
+        board = board.model_copy(update={"planes_mm": tuple(-z for z in board.planes_mm)})
+    elif mistake == "angle":
+        camera = dataclasses.replace(camera, orientation=turned)
+    else:  # the stored pictures are read as they are, as if a flip had made them so
+        camera = dataclasses.replace(camera, orientation=turned, stated_flip="horizontal")
+    wrong = dataclasses.replace(experiment, board=board, cameras=(camera,))
+    decoder = calibration.cameras["only"].decoder
+    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder))
+
+
+def test_what_is_right_has_no_mistake(rig):
+    experiment, _, calibration = rig
+    assert contradictions.cause(experiment, lambda setup: calibration.cameras["only"].decoder) is None
+
+
+@pytest.mark.slow
+def test_a_board_that_no_such_camera_can_see_is_refused(rig):
+    experiment, _, _ = rig
+    camera = dataclasses.replace(experiment.cameras[0], orientation=Orientation(30.0))
+    wrong = dataclasses.replace(experiment, cameras=(camera,))
     with pytest.raises(lfpiv.InputError, match="image_flip"):
         lfpiv.calibrate(wrong)
+
+
+@pytest.mark.parametrize(
+    ("direction", "seen"),
+    [
+        ((0, 0, 1), {(False, False)}),
+        ((1, 0, 1), {(False, False), (True, False)}),  # upside down it looks the same
+        ((0, 1, 1), {(False, False), (False, True)}),
+        ((1, 1, 1), {(False, False), (True, False), (False, True), (True, True)}),
+    ],
+)
+def test_mirrors_that_the_dots_of_a_camera_show(direction, seen):
+    tried = hypotheses.mistakes(Orientation.from_direction(direction), (0.0, 1.0))
+    assert {(one.left_right, one.up_down) for one in tried} == seen
+    assert tried[0] == hypotheses.RIGHT
+    assert {one.planes for one in tried} == {"", "reversed", "negated"}
+
+
+def test_a_flip_that_nothing_shows_is_asked_for(rig):
+    experiment, _, _ = rig
+    front = dataclasses.replace(experiment.cameras[0], orientation=Orientation(0.0), stated_flip=None)
+    for stated, codes in ((None, [Code.FLIP_UNSTATED]), ("none", [])):
+        camera = dataclasses.replace(front, stated_flip=stated)
+        with warn.collected() as warnings:
+            contradictions.warn_unstated(dataclasses.replace(experiment, cameras=(camera,)))
+        assert [warning.code for warning in warnings] == codes
 
 
 @pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4), (5, 3), (30, 30)])

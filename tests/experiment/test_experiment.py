@@ -5,7 +5,7 @@ import pytest
 import tifffile
 
 from lfpiv.errors import InputError
-from lfpiv.experiment import images
+from lfpiv.experiment import axes, images
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.settings.experiment import ExperimentTable
@@ -57,6 +57,17 @@ def test_flip_is_undone_in_every_image_of_the_camera(tiny_experiment, flip, undo
         assert image.dtype == np.float32 and image.flags.c_contiguous
         np.testing.assert_array_equal(image, undo(read(plain)))
     np.testing.assert_array_equal(flipped.white("right"), plain.white("right"))
+
+
+def test_left_handed_axes_are_read_from_pictures_that_lie_as_stated(tiny_experiment):
+    edit(tiny_experiment, 'name = "left"', 'name = "left"\nimage_flip = "horizontal"')
+    ordinary = open_experiment(tiny_experiment)
+    edit(tiny_experiment, "[board]", '[board]\naxes = "left-handed"')
+    left_handed = open_experiment(tiny_experiment)
+    np.testing.assert_array_equal(left_handed.white("left"), np.fliplr(ordinary.white("left")))
+    assert "x points right and y up for 'left'" in axes.directions(ordinary)
+    assert "left-handed, as board.axes says" in axes.handedness(left_handed)
+    assert "not stated for 'right'" in axes.handedness(ordinary)
 
 
 def test_a_byte_order_mark_is_no_part_of_the_file(tiny_experiment):

@@ -91,7 +91,7 @@ def measure_board(
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = Signals.from_images(images, decoder, dark)
     with threadpool_limits(1, user_api="blas"):  # threads slow down operations on small matrices
-        detection = _find(signals, decoder, board, orientation)
+        detection = find_board(signals, decoder, board, orientation)
         if estimator == "gaussian":
             labels = label_by_gaussian(signals, decoder, board, detection)
         else:
@@ -102,7 +102,16 @@ def measure_board(
     return _count(labels, board, detection)
 
 
-def _find(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation | None) -> Detection:
+def find_board(
+    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation | None
+) -> Detection:
+    """Find and name the dots of one camera in all planes, by the board's mark if it has one.
+
+    Raises
+    ------
+    InputError
+        If no plane shows the board's dots.
+    """
     if board.mark:
         return find_marked_dots(signals, decoder, board, orientation)
     assert orientation is not None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.saturation import saturated_pixels
 
@@ -41,6 +42,11 @@ class Planes(Sequence[np.ndarray]):
                 return image
             self._held[plane] = counts
         return self._held[plane]
+
+
+def board_images(experiment: Experiment, camera: str) -> Planes:
+    """Return the images of the board of one camera."""
+    return Planes(lambda plane: experiment.board_image(camera, plane), len(experiment.board.planes_mm))
 
 
 @dataclass(frozen=True, eq=False)

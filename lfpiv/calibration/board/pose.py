@@ -156,6 +156,8 @@ class Rectified:
     """Spacing of the elements [mm]."""
     noise: float
     """Standard deviation of the response, in shares of the white image's light."""
+    light: np.ndarray
+    """Light over the white image's, shape (y, x); nan where the camera sees nothing."""
 
     def peaks(self, radius_mm: float, sign: int) -> Blobs:
         """Return the significant blobs, at most one within `radius_mm`; `sign` is -1 for dark ones."""
@@ -242,4 +244,5 @@ class Rectifier:
         response[lit] = narrow[0][lit] / narrow[1][lit] - wide[0][lit] / wide[1][lit]
         response *= np.sqrt(narrow[1] / np.median(narrow[1][lit])) if lit.any() else 0  # noise falls with the light
         noise = NORMAL_MAD * np.median(np.abs(response[lit])) if lit.any() else 0.0
-        return Rectified(response / max(noise, 1e-12), corner, bin_mm, noise)
+        share = np.divide(narrow[0], narrow[1], out=np.full(shape, np.nan), where=lit)
+        return Rectified(response / max(noise, 1e-12), corner, bin_mm, noise, share)
