@@ -21,8 +21,8 @@ BRIGHT_PERCENTILE = 99.5
 """Percentile of the light at which the grey values end."""
 X_COLOUR, Y_COLOUR = "#ff5a4f", "#4fc3ff"
 QUESTION = (
-    "Compare each picture with the real board, seen from the cameras: does x point where you count it as growing, and y "
-    "up? Letters or a corner of the board must look as they do there."
+    "Compare each picture with the real board, seen from the cameras: does x point where you count it as growing, "
+    "and y up? Letters or a corner of the board must look as they do there."
 )
 LINE = 92
 """Letters in a line of the text above the picture."""
