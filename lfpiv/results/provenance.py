@@ -49,6 +49,16 @@ class Marks:
     sealed: bool = False
     """Whether a digest shows that the file is as it was written; files of earlier versions have none."""
 
+    @property
+    def images(self) -> list[tuple[str, str]]:
+        """Path and digest of each image that the result was made from, as far as they are known."""
+        try:
+            stored = read_object(self.depends_on).get(IMAGES)
+        except RecordError:
+            return []
+        entries = stored if isinstance(stored, list) else []
+        return [(str(one[0]), str(one[-1])) for one in entries if isinstance(one, list) and len(one) > 3 and one[-1]]
+
 
 @dataclass(frozen=True)
 class Stamp:

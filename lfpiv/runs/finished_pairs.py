@@ -1,12 +1,15 @@
-"""Figures of all finished pairs of a run, in a temporary file: the memory holds 8 bytes per pair."""
+"""Figures of all finished pairs of a run, in a temporary file: the memory holds 8 bytes per pair, 24 per image."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+
+import numpy as np
 
 from lfpiv import files
 from lfpiv.files import MIB, writing
@@ -34,9 +37,10 @@ class FinishedPairs(Mapping[int, PairFigures]):
         self._places = array("q", [_ABSENT]) * len(numbers)
         self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES, dir=str(folder))
         self._end = 0
+        self._images = array("Q")  # pair, hash of the path, hash of the content of each image
 
-    def add(self, pair: int, figures: PairFigures) -> None:
-        """Store the figures of a pair, in place of earlier ones.
+    def add(self, pair: int, figures: PairFigures, images: Iterable[tuple[str, str]] = ()) -> None:
+        """Store the figures of a pair, in place of earlier ones, and which images it was made from: path and digest.
 
         Raises
         ------
@@ -51,11 +55,24 @@ class FinishedPairs(Mapping[int, PairFigures]):
         self._count += self._places[place] == _ABSENT
         self._places[place] = self._end
         self._end += len(line)
+        for image in images:
+            self._images.extend((pair, *map(_number, image)))
 
     def clear(self) -> None:
         """Forget all pairs."""
         self._places = array("q", [_ABSENT]) * len(self._numbers)
         self._count = self._end = 0
+        self._images = array("Q")
+
+    def copies(self) -> dict[int, int]:
+        """Return the pairs with an image that equals one of another path, each with the first pair that has it."""
+        pair, path, content = np.array(self._images, np.uint64).reshape(-1, 3).T
+        order = np.lexsort((path, pair, content))
+        pair, path, content = pair[order], path[order], content[order]
+        first = np.flatnonzero(np.append(True, content[1:] != content[:-1])[: len(content)])
+        of = np.repeat(first, np.diff(np.append(first, len(content))))
+        again = np.flatnonzero((path != path[of]) & (pair != pair[of]))
+        return dict(sorted(((int(pair[item]), int(pair[of[item]])) for item in again), reverse=True))
 
     def __getitem__(self, pair: int) -> PairFigures:
         if pair not in self:
@@ -71,3 +88,8 @@ class FinishedPairs(Mapping[int, PairFigures]):
 
     def __len__(self) -> int:
         return self._count
+
+
+def _number(text: str) -> int:
+    """Return 64 bits of a hash."""
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")

@@ -232,7 +232,7 @@ class Run:
     def _keep(self, found: PairFiles) -> None:
         """Keep the figures of a pair's vectors for the summary, if they fit."""
         if (marks := found.fitting_vectors()) is not None:
-            self.finished.add(found.pair, pair_figures.read_figures(found.vectors, marks))
+            self.finished.add(found.pair, pair_figures.read_figures(found.vectors, marks), marks.images)
 
     def has_some_volumes(self) -> bool:
         """Return whether a selected pair has both volumes and they fit."""
@@ -384,6 +384,7 @@ class Run:
             guard=self.guard,
             damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
             refinement=self.refinement,
+            copies=self.finished.copies(),
         )
 
     def _tracks(self) -> dict[str, Any] | None:

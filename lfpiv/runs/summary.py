@@ -72,6 +72,8 @@ class Contents:
     """Damping by ghosts; None if it was not measured."""
     refinement: Refinement | None = None
     """Size of the particles and refinement; None if it was not measured."""
+    copies: Mapping[int, int] = field(default_factory=dict)
+    """Pairs with an image of another pair, each with that one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,6 +309,7 @@ def _warnings(
         *map(Warning.from_json, weights.get("warnings", ())),
         *contents.background_warnings,
         *of_pairs,
+        *copied_warnings(contents.copies, experiment.noun),
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
@@ -332,6 +335,14 @@ def _refinement(experiment: Experiment, found: Refinement | None) -> dict[str, A
         "particle_size_voxel": None if found is None else found.size_voxel,
         "pairs": [] if found is None else list(found.pairs),
     }
+
+
+def copied_warnings(copies: Mapping[int, int], noun: str) -> list[Warning]:
+    """Return the warnings about pairs with an image of another pair."""
+    return gather(
+        Warning(code=Code.COPIED, pairs=(pair,), figures={"first": first, "noun": noun})
+        for pair, first in sorted(copies.items())
+    )
 
 
 def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:

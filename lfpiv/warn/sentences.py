@@ -16,6 +16,7 @@ class Code(enum.Enum):
     SATURATED = "saturated"
     UNEVEN = "uneven"
     STANDING = "standing"
+    COPIED = "copied"
     DIM = "dim"
     EMPTY = "empty"
     # white image and microlens array
@@ -100,6 +101,10 @@ SENTENCES: Mapping[Code, str] = {
         "check the laser's pulses and the shutter"
     ),
     Code.STANDING: "light stands still at {place}; it is {share:percent} % of an image's light: {remedy}",
+    Code.COPIED: (
+        "an image is a copy, byte by byte, of an image of {noun} {first:.0f}, so the same light counts twice. Check "
+        "particles.images, and what was copied"
+    ),
     Code.DIM: (
         "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "
         "give 0.2 or more): displacements are biased towards zero. More light, more particles or larger windows help"

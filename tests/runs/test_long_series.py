@@ -122,6 +122,19 @@ def test_figures_of_finished_pairs_are_a_mapping_on_disk(tmp_path):
     assert list(kept) == [] and list(tmp_path.iterdir()) == []
 
 
+def test_images_that_stand_in_two_pairs_under_two_names_are_copies(tmp_path):
+    kept = FinishedPairs(range(10, 20), tmp_path)
+    assert kept.copies() == {}
+    kept.add(18, figures(0.5), [("a18", "one"), ("b18", "two")])
+    kept.add(12, figures(0.5), [("a12", "three"), ("b12", "two")])
+    kept.add(13, figures(0.5), [("b12", "two"), ("b13", "four")])  # of a series: the same instant
+    kept.add(15, figures(0.5), [("a15", "three"), ("b15", "five")])
+    kept.add(15, figures(0.5), [("a15", "three"), ("b15", "five")])
+    assert kept.copies() == {15: 12, 18: 12}
+    kept.clear()
+    assert kept.copies() == {}
+
+
 def test_memory_is_bytes_per_pair(tmp_path):
     """Figures, warnings and the search of a hundred thousand pairs, half of them finished."""
     tracemalloc.start()
