@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import math
 import os
+import platform
+import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
@@ -36,13 +39,47 @@ def size_text(size: int) -> str:
     return f"{size} bytes"
 
 
+def scratch_path(path: Path) -> Path:
+    """Return the unique path of a file or folder beside `path` while this process writes it."""
+    return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
+
+
+@functools.cache
+def _machine() -> str:
+    """Return a short name of the processes that share their numbers with this one: machine and, on Linux, container."""
+    space = ""
+    with contextlib.suppress(OSError):
+        space = os.readlink("/proc/self/ns/pid")
+    return hashlib.blake2b(f"{platform.node()} {space}".encode(), digest_size=4).hexdigest()
+
+
+def remove_leftovers(folder: Path, pattern: str = ".*.tmp") -> None:
+    """Remove what killed processes of this machine left half-written in a folder."""
+    for path in folder.glob(pattern):
+        match = re.search(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.tmp$", path.name)
+        if match is None or match[1] != _machine() or _is_alive(int(match[2])):
+            continue
+        with contextlib.suppress(OSError):
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # of another user
+        return True
+    return True
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a scratch path in the folder of `path`; rename it to `path` at the end, remove it on any failure.
 
-    The scratch path is unique, so two processes may write the same file. That of a killed process ends in ``.tmp``.
+    The scratch path is unique, so two processes may write the same file. `remove_leftovers` finds those of killed ones.
     """
-    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    scratch = scratch_path(path)
     try:
         yield scratch
         with scratch.open("rb") as file:
@@ -50,6 +87,17 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Yield a scratch path beside `path` for a new folder; rename it to `path`, which must not exist, at the end."""
+    scratch = scratch_path(path)
+    try:
+        yield scratch
+        os.replace(scratch, path)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def write_bytes(content: bytes | memoryview, path: Path) -> None:

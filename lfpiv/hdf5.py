@@ -59,6 +59,68 @@ def options(shape: tuple[int, ...], *, zipped: bool = True) -> dict[str, Any]:
     return {"fletcher32": True} | ({"compression": "gzip", "compression_opts": 1} if zipped else {})
 
 
+class Disk(FileIO):
+    """A file for HDF5 to write to. HDF5 crashes the process where a write fails, so failures are kept until `check`.
+
+    Parameters
+    ----------
+    path : Path
+    mode : {"w+", "r+"}
+        Make a new file, or change one.
+    """
+
+    _error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        """Write all bytes; after a failure do nothing."""
+        left = memoryview(content).cast("B")
+        size = len(left)
+        try:
+            while self._error is None and left:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self._error = error
+        return size
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the length; after a failure do nothing."""
+        try:
+            return super().truncate(size) if self._error is None else size or 0
+        except OSError as error:
+            self._error = error
+            return size or 0
+
+    def check(self) -> None:
+        """Raise the first failure.
+
+        Raises
+        ------
+        OSError
+            If a write failed since the file was opened.
+        """
+        if self._error is not None:
+            raise self._error
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[Disk]:
+    """Yield a new file for HDF5 to write to, and seal it at the end.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    with Disk(path, "w+") as file:
+        try:
+            yield file
+        except Exception:
+            file.check()  # what HDF5 makes of a failure follows from it
+            raise
+        file.check()
+    seal(path)
+
+
 def seal(target: Path | io.BytesIO) -> None:
     """Append the digest of a complete HDF5 file. Remove an older seal.
 
@@ -70,16 +132,18 @@ def seal(target: Path | io.BytesIO) -> None:
     import h5py
 
     text = f"{ALGORITHM} of all bytes before the last {_SEAL_BYTES}, which state it"
-    with h5py.File(target, "r+") as file:
-        if file.attrs.get(SEALED) != text:
-            file.attrs[SEALED] = text
     with contextlib.ExitStack() as stack:
-        content: Any = target if isinstance(target, io.BytesIO) else stack.enter_context(target.open("r+b"))
+        content: Any = target if isinstance(target, io.BytesIO) else stack.enter_context(Disk(target, "r+"))
+        with h5py.File(content, "r+") as file:
+            if file.attrs.get(SEALED) != text:
+                file.attrs[SEALED] = text
         end = _end(content)
         content.truncate(end)
         digest = _digest(content, end)
         content.seek(end)
         content.write(_MARK + digest + b"\n")
+        if isinstance(content, Disk):
+            content.check()
 
 
 def is_sealed(path: str | Path) -> bool:
@@ -165,6 +229,20 @@ def verify(path: str | Path) -> None:
     """Verify a file as `opened` does."""
     with opened(path):
         pass
+
+
+def require_opening(path: Path) -> None:
+    """Raise what h5py says of an HDF5 file that it cannot open. h5netcdf prints a traceback beside it.
+
+    Raises
+    ------
+    OSError
+        If it is an HDF5 file that cannot be opened.
+    """
+    import h5py
+
+    if h5py.is_hdf5(path):
+        h5py.File(path, "r").close()
 
 
 # -- the seal ----------------------------------------------------------------------------------------------------------

@@ -1,6 +1,9 @@
 """Files of a run: whole-or-nothing writing, and the hash of settings."""
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,3 +36,19 @@ def test_settings_hash_sees_every_value_and_no_order():
 def test_an_unknown_public_name_is_refused():
     with pytest.raises(AttributeError, match="frobnicate"):
         _ = lfpiv.frobnicate
+
+
+def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path):
+    write = "import os, sys; from lfpiv import files\nwith files.replacing(files.Path(sys.argv[1])) as path:\n"
+    write += "    path.touch(); print(path, flush=True); os._exit(9)"
+    done = subprocess.run([sys.executable, "-c", write, str(tmp_path / "a")], capture_output=True, text=True)
+    left = tmp_path / Path(done.stdout.strip()).name
+    assert left.exists()
+    for path in (tmp_path / ".a.tmp", tmp_path / ".a.0123abcd-1-0123abcd.tmp"):  # nobody's, another machine's
+        path.touch()
+    with files.replacing(tmp_path / "b") as mine, files.replacing_folder(tmp_path / "c") as folder:
+        mine.touch()
+        folder.mkdir()
+        files.remove_leftovers(tmp_path)
+    assert not left.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.0123abcd-1-0123abcd.tmp", ".a.tmp", "b", "c"]

@@ -7,8 +7,7 @@ import json
 import logging
 import os
 import shutil
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,9 @@ from lfpiv.benchmark.plain_truth import (
 from lfpiv.benchmark.readme import README, readme
 from lfpiv.benchmark.truth import ABOUT, TRUTH
 from lfpiv.errors import InputError
-from lfpiv.files import write_json, writing
+from lfpiv.files import remove_leftovers, replacing_folder, scratch_path, write_json, writing
 from lfpiv.progress import Progress, ignore_progress
+from lfpiv.records import RecordError, read_object, read_text
 from lfpiv.results.datasets import write_dataset
 from lfpiv.simulation.flows import Tracers
 from lfpiv.simulation.scene import Scene
@@ -133,13 +133,17 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
         return known
     if truth != folder / TRUTH and _overlap(folder.resolve(), truth.resolve()):
         raise InputError(f"--truth {truth}: expected a folder outside {folder}, not around it. Name another one.")
+    if not folder.exists() and _is_of(_about_of(truth), case, scene):
+        shutil.rmtree(truth)  # of a command that was killed between truth and data
     for place in (folder, truth):
         if place.exists() and not (place.is_dir() and not any(place.iterdir())):
             raise InputError(f"{place}: expected an empty or absent folder to write to, found files. Name another one.")
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         truth.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        remove_leftovers(folder.parent, f".{folder.name}.*.tmp")
+        scratch = scratch_path(folder)
+        scratch.mkdir()
         try:
             made = _write(case, scene, scratch / "data", folder, truth, lambda _, done: progress(case.name, done))
             if truth != folder / TRUTH:
@@ -159,24 +163,33 @@ def _overlap(one: Path, other: Path) -> bool:
 
 def _move(source: Path, target: Path) -> None:
     """Move a folder, to another disk too; it appears under its name when it is complete."""
-    near = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
-        shutil.move(source, near / "truth")
-        os.replace(near / "truth", target)
-    finally:
-        shutil.rmtree(near, ignore_errors=True)
+    remove_leftovers(target.parent, f".{target.name}.*.tmp")
+    with replacing_folder(target) as near:
+        shutil.move(source, near)
 
 
 def _made_before(case: Case, scene: Scene, folder: Path, truth: Path) -> Made | None:
     """Return a case that its folders hold complete, with the same seed."""
-    try:
-        about = [json.loads((place / ABOUT).read_text("utf-8")) for place in (folder, truth)]
-    except (OSError, ValueError):
+    about = [_about_of(place) for place in (folder, truth)]
+    if not (_is_of(about[0] | {"seed": scene.seed}, case, scene) and _is_of(about[1], case, scene)):
         return None
-    same = all((one.get("benchmark"), one.get("case")) == (case_list().version, case.name) for one in about)
-    if not same or about[1].get("seed") != scene.seed:
+    if not {"verdict", "reason"} <= about[1].keys():
         return None
     return Made(case=case.name, folder=folder, truth=truth, verdict=about[1]["verdict"], reason=about[1]["reason"])
+
+
+def _about_of(place: Path) -> dict[str, Any]:
+    """Return what a folder says of itself; empty if it says nothing."""
+    try:
+        return read_object(read_text(place / ABOUT))
+    except (OSError, RecordError):
+        return {}
+
+
+def _is_of(about: Mapping[str, Any], case: Case, scene: Scene) -> bool:
+    """Return whether a folder says that it belongs to a case, made with the seed of the scene."""
+    stated = tuple(about.get(name) for name in ("benchmark", "case", "seed"))
+    return stated == (case_list().version, case.name, scene.seed)
 
 
 def _write(case: Case, scene: Scene, data: Path, folder: Path, truth: Path, progress: Progress) -> Made:

@@ -13,15 +13,23 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from lfpiv import hdf5
 from lfpiv.benchmark import names
 from lfpiv.benchmark.measured import MeasuredField, lattice_of
 from lfpiv.benchmark.truth import Point, Truth
 from lfpiv.errors import InputError
+from lfpiv.experiment.readers.limits import LARGEST_IMAGE, SMALL_IMAGE
 
 NETCDF, TABLES = (".nc", ".nc4", ".cdf"), (".csv", ".txt", ".dat", ".tsv")
 """Endings of files that are read."""
+LARGEST_EXPANSION = 200
+"""Largest size of all values over that of their file; vectors and volumes reach some 50."""
+LARGEST_NUMBER = 1e12
+"""Magnitude at which a number that a file states of itself is no measurement."""
 VECTORS = "vectors"
 """Folder of vectors in the folder of a run."""
+LONGEST_MM = 1e6
+"""Length at which a position or displacement is a mark for a missing value, such as 1e20 or 1e300 [mm]."""
 PARTICLE = "particle"
 """Name of a dimension over particles."""
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")
@@ -161,7 +169,7 @@ def _stated_number(columns: _Columns, truth: Truth, options: ReadOptions, number
         return options.number
     for name in ("pair", "instant"):
         if name in columns.attributes:
-            return int(np.ravel(columns.attributes[name])[0])
+            return int(_stated(columns, name)[0])
     if number is not None:
         return number
     raise InputError(
@@ -181,11 +189,16 @@ def _field(columns: _Columns, rows: np.ndarray, number: int, truth: Truth, optio
         return names.to_mm(stated[role], unit, f"{columns.path}: {name}", dt_s=dt_s, voxel_mm=voxel)
 
     moved = names.VELOCITY if all(role in stated for role in names.VELOCITY) else names.DISPLACEMENT
-    position = np.stack([mm(role, None, None) for role in names.POSITION], axis=1)
-    displacement = np.stack([mm(role, truth.scene.dt_s, voxel_mm) for role in moved], axis=1)
+
+    def along(roles: Sequence[str], *scale: float | None) -> np.ndarray:
+        values = np.stack([mm(role, *(scale or (None, None))) for role in roles], axis=1)
+        return np.where(np.abs(values) < LONGEST_MM, values, np.nan)
+
+    position = along(names.POSITION)
+    displacement = along(moved, truth.scene.dt_s, voxel_mm)
     spread = None
     if all(role in stated for role in names.UNCERTAINTY):
-        spread = np.stack([mm(role, truth.scene.dt_s, voxel_mm) for role in names.UNCERTAINTY], axis=1)
+        spread = along(names.UNCERTAINTY, truth.scene.dt_s, voxel_mm)
     flag = stated.get(names.VALID)
     is_particles = options.kind == "particles" or (options.kind == "auto" and columns.of_particles)
     if options.kind == "auto" and not is_particles:
@@ -197,10 +210,10 @@ def _field(columns: _Columns, rows: np.ndarray, number: int, truth: Truth, optio
         displacement_mm=displacement,
         valid=np.ones(len(position), bool) if flag is None else np.nan_to_num(flag) > 0,
         uncertainty_mm=spread,
-        window_mm=None if is_particles else options.window_mm or _window_mm(columns.attributes, voxel_mm),
+        window_mm=None if is_particles else options.window_mm or _window_mm(columns, voxel_mm),
         is_particles=is_particles,
-        seconds=options.seconds if options.seconds is not None else _seconds(columns.attributes),
-        memory_mib=next((_scalar(columns.attributes[name]) for name in _MEMORY if name in columns.attributes), None),
+        seconds=options.seconds if options.seconds is not None else _seconds(columns),
+        memory_mib=next((float(_stated(columns, name)[0]) for name in _MEMORY if name in columns.attributes), None),
         notes=notes if any(str(unit).lower() in names.VOXEL_UNITS for unit in _used_units(columns, moved)) else (),
     )
 
@@ -212,44 +225,72 @@ def _used_units(columns: _Columns, moved: tuple[str, ...]) -> list[object]:
 def _voxel_mm(columns: _Columns, truth: Truth) -> tuple[float, tuple[str, ...]]:
     """Return the edge of the file's voxel, or that of the data set's with a note."""
     if "voxel_mm" in columns.attributes:
-        edges = np.ravel(np.asarray(columns.attributes["voxel_mm"], float))
-        if len(edges) and np.allclose(edges, edges[0]) and edges[0] > 0:
+        edges = _stated(columns, "voxel_mm")
+        if np.allclose(edges, edges[0]) and edges[0] > 0:
             return float(edges[0]), ()
         raise InputError(f"{columns.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
     return truth.voxel_mm, (f"no attribute voxel_mm: voxels are taken to be the data set's, {truth.voxel_mm:g} mm",)
 
 
-def _window_mm(attributes: Mapping[str, Any], voxel_mm: float) -> Point | None:
+def _window_mm(columns: _Columns, voxel_mm: float) -> Point | None:
     """Return the window that the attributes state, edges (x, y, z)."""
     for name in ("window_mm", "interrogation_window_mm"):
-        if name in attributes:
-            x, y, z = np.broadcast_to(np.ravel(np.asarray(attributes[name], float)), 3)
+        if name in columns.attributes:
+            edges = _stated(columns, name)
+            if len(edges) not in (1, 3) or edges.min() <= 0:
+                raise InputError(f"{columns.path}: expected {name}, one or three lengths > 0, found {edges.tolist()}.")
+            x, y, z = np.broadcast_to(edges, 3)
             return float(x), float(y), float(z)
     try:
-        edges = json.loads(attributes["settings"])["windows"][-1]  # of lfpiv, in voxels (z, y, x)
+        edges = json.loads(columns.attributes["settings"])["windows"][-1]  # of lfpiv, in voxels (z, y, x)
         z, y, x = (float(voxel_mm * edge) for edge in edges)
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     return x, y, z
 
 
-def _seconds(attributes: Mapping[str, Any]) -> float | None:
+def _seconds(columns: _Columns) -> float | None:
     for group in _SECONDS:
-        if all(name in attributes for name in group):
-            return sum(_scalar(attributes[name]) for name in group)
+        if all(name in columns.attributes for name in group):
+            return float(sum(_stated(columns, name)[0] for name in group))
     return None
 
 
-def _scalar(value: object) -> float:
-    return float(np.ravel(np.asarray(value, float))[0])
+def _stated(columns: _Columns, name: str) -> np.ndarray:
+    """Return the numbers of an attribute, one or more; refuse others."""
+    value = columns.attributes[name]
+    try:
+        found = np.ravel(np.asarray(value, float))
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if not len(found) or not (np.abs(found) < LARGEST_NUMBER).all():
+        raise InputError(f"{columns.path}: expected numbers in the attribute {name!r}, found {str(value)[:60]!r}.")
+    return found
+
+
+def load_netcdf(path: Path) -> xr.Dataset:
+    """Read a NetCDF file of any program, with the numbers of its axes as they are.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or declares far more values than its bytes hold.
+    """
+    try:
+        hdf5.require_opening(path)
+        with xr.open_dataset(path, decode_times=False) as dataset:
+            values, size = sum(variable.size for variable in dataset.variables.values()), path.stat().st_size
+            if values > LARGEST_IMAGE or 8 * values > SMALL_IMAGE + LARGEST_EXPANSION * size:
+                raise ValueError(f"{size:,} bytes declare {values:,} values")
+            return dataset.load()
+    except Exception as error:  # readers raise whatever they meet
+        text = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: expected a NetCDF file, found that it cannot be read ({text}).") from None
 
 
 def _read_netcdf(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
     """Return the vectors of a NetCDF file, whatever the order of its axes."""
-    try:
-        dataset = xr.load_dataset(path, decode_times=False)
-    except Exception as error:
-        raise InputError(f"{path}: expected a NetCDF file, found that it cannot be read ({error}).") from None
+    dataset = load_netcdf(path)
     about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
     for name in set(about) & set(map(str, dataset.coords)):
         axis = str(about[name].get("axis", "")).lower()

@@ -11,7 +11,7 @@ import xarray as xr
 from lfpiv import metrics
 from lfpiv.benchmark import names
 from lfpiv.benchmark.figures import BLOB_VOXEL, MATCH_VOXEL
-from lfpiv.benchmark.readers import NETCDF
+from lfpiv.benchmark.readers import NETCDF, load_netcdf
 from lfpiv.benchmark.truth import Truth
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES, Grid
@@ -97,10 +97,7 @@ def read_volume(path: Path) -> xr.DataArray:
     InputError
         If the file cannot be read, or has no single volume of finite numbers on even axes.
     """
-    try:
-        dataset = xr.load_dataset(path, decode_times=False)
-    except Exception as error:
-        raise InputError(f"{path}: expected a NetCDF file, found that it cannot be read ({error}).") from None
+    dataset = load_netcdf(path)
     solids = [str(name) for name in dataset.data_vars if set(dataset[name].dims) == set(AXES)]
     if len(solids) != 1:
         found = ", ".join(solids) or "none"

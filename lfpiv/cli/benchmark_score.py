@@ -90,13 +90,16 @@ def score(
     """
     if out is not None and out.suffix.lower() not in ENDINGS:
         raise InputError(f"--out {out}: expected a file that ends in {' or '.join(ENDINGS)}.")
+    if out is not None and (not out.parent.is_dir() or out.is_dir()):
+        there = "a folder of that name" if out.is_dir() else f"no folder {out.parent}. Make it first"
+        raise InputError(f"--out {out}: expected a file in a folder that exists, found {there}.")
     selected = terminal.parse_pairs(pairs)
     with terminal.OUTPUT.progress() as progress:
         from lfpiv.benchmark import page
         from lfpiv.benchmark.readers import ReadOptions
         from lfpiv.benchmark.score import ScoreOptions, report, score_results
         from lfpiv.benchmark.truth import open_truth
-        from lfpiv.files import write_json
+        from lfpiv.files import write_json, writing
 
         reading = ReadOptions(
             names=_pairs_of("--name", name), units=_pairs_of("--unit", unit), window_mm=_edges(window_mm), kind=kind,
@@ -108,10 +111,11 @@ def score(
             opened, results, options, labels=label or (), progress=lambda done: progress("score", done)
         )
         found = report(opened, scores)
-        if out is not None and out.suffix.lower() == ".json":
-            write_json(found, out)
-        elif out is not None:
-            page.write_page(opened, scores, out)
+        with writing(out or Path()):
+            if out is not None and out.suffix.lower() == ".json":
+                write_json(found, out)
+            elif out is not None:
+                page.write_page(opened, scores, out)
     terminal.OUTPUT.show(found, lambda: print_scores(scores, out))
 
 

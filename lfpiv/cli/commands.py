@@ -405,14 +405,26 @@ def call(arguments: Sequence[str] | None = None) -> int:
         return _fail(1, interrupts.MESSAGE, error)
     except (StorageError, ClusterError) as error:
         return _fail(1, str(error), error)
+    except OSError as error:
+        if error.errno is None:
+            return _unexpected(error)
+        place = f"{error.filename}: " if error.filename else ""
+        reason = (error.strerror or str(error)).lower()
+        return _fail(
+            1, f"{place}{reason}. Finished results are complete. Solve this, and run the command again.", error
+        )
     except MemoryError as error:
         return _fail(1, "out of memory. Raise volume.voxel_mm, shrink volume.size_mm, or free memory.", error)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of the command line parser
             return _fail(2, f"{error.format_message()} Try 'lfpiv --help'.", None)
-        text = " ".join(str(error).split())
-        hint = " Run again with --debug for details; `lfpiv doctor` shows what a bug report needs."
-        return _fail(1, f"unexpected {type(error).__name__}: {text}.{'' if _output.debug else hint}", error)
+        return _unexpected(error)
+
+
+def _unexpected(error: Exception) -> int:
+    text = " ".join(str(error).split())
+    hint = " Run again with --debug for details; `lfpiv doctor` shows what a bug report needs."
+    return _fail(1, f"unexpected {type(error).__name__}: {text}.{'' if _output.debug else hint}", error)
 
 
 def _fail(status: int, message: str, error: BaseException | None) -> int:

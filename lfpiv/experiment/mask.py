@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 import xarray as xr
 
+from lfpiv import hdf5
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import solid_shares
@@ -218,6 +219,7 @@ def _require(path: Path) -> None:
 def _reading(path: Path) -> Iterator[None]:
     """Name a file that cannot be read in the error."""
     try:
+        hdf5.require_opening(path)
         yield
     except InputError:
         raise

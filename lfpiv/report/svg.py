@@ -71,8 +71,12 @@ def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", le
         offset.set(color=INK, fontsize=SMALL_POINT)
     for spine in axes.spines.values():
         spine.set(color=INK, linewidth=0.6)
+    texts = [axes.title, axes.xaxis.label, axes.yaxis.label]
     if legend:
-        axes.legend(fontsize=SMALL_POINT, labelcolor=INK, frameon=False, handlelength=1.4, borderaxespad=0.2)
+        shown = axes.legend(fontsize=SMALL_POINT, labelcolor=INK, frameon=False, handlelength=1.4, borderaxespad=0.2)
+        texts += shown.get_texts()
+    for text in texts:
+        text.set_parse_math(False)  # a name may hold dollar signs
 
 
 def colour_bar(figure: Figure, shown: ScalarMappable, axes: Axes, label: str, *, location: str = "right") -> None:

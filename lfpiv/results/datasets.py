@@ -5,11 +5,8 @@ A file gets its name when it is complete. So an existing file is a finished resu
 
 from __future__ import annotations
 
-import errno
 import io
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -74,14 +71,15 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
     Raises
     ------
     OSError
-        If the disk has less space than the dataset takes uncompressed: HDF5 does not survive a disk that fills up.
+        If the file cannot be written.
     """
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    if dataset.nbytes > shutil.disk_usage(path.parent).free:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    with replacing(path) as scratch:  # straight to disk: it may be larger than the memory
-        packed(dataset, attributes or {}).to_netcdf(scratch, engine="h5netcdf")
-        hdf5.seal(scratch)
+    with replacing(path) as scratch, hdf5.written(scratch) as disk:  # it may be larger than the memory
+        with h5netcdf.File(disk, "w") as file:
+            packed(dataset, attributes or {}).dump_to_store(H5NetCDFStore(file))
 
 
 def packed(dataset: xr.Dataset, attributes: Mapping[str, Any], *, root: bool = True) -> xr.Dataset:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv.errors import InputError
+from lfpiv.files import remove_leftovers, writing
 from lfpiv.records import RecordError, read_object, validate
 from lfpiv.settings.particles import Series
 from lfpiv.warn import Code, Warning, warn
@@ -181,14 +182,8 @@ class Folder:
         InputError
             If another run holds the folder. The message names its process.
         """
-        file = _lock(self.lock)
-        try:
+        with locked(self.lock):
             yield
-        finally:
-            if file is not None:
-                with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
-                    self.lock.unlink()
-                os.close(file)
 
 
 class VectorFiles(Mapping[int, Path]):
@@ -207,6 +202,26 @@ class VectorFiles(Mapping[int, Path]):
 
     def __len__(self) -> int:
         return len(self._pairs)
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock file against other processes that write into its folder, and remove it at the end.
+
+    Raises
+    ------
+    InputError
+        If another process holds it. The message names the process.
+    """
+    with writing(path):
+        file = _lock(path)
+    try:
+        yield
+    finally:
+        if file is not None:
+            with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
+                path.unlink()
+            os.close(file)
 
 
 def _lock(path: Path) -> int | None:
@@ -235,9 +250,10 @@ def _lock(path: Path) -> int | None:
         if same:
             break
         os.close(file)  # its holder removed it after this process opened it
-    os.ftruncate(file, 0)
     since = time.strftime("%Y-%m-%d %H:%M:%S")
-    os.pwrite(file, json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
+    with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, nameless
+        os.ftruncate(file, 0)
+        os.pwrite(file, json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode(), 0)
     return file
 
 
@@ -299,6 +315,7 @@ def make_writable(path: Path) -> list[Path]:
             f"{path}: expected an output folder that can be written, found: {(error.strerror or str(error)).lower()}. "
             "Choose another one with --out."
         ) from None
+    remove_leftovers(path)
     folder = Folder(path)
     for place in (folder.vectors(0).parent, folder.volume(0, 0).parent, folder.particles(0).parent):
         if place.exists() and not place.is_dir():

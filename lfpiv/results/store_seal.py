@@ -1,15 +1,20 @@
-"""Trust in stores: a store is sealed when it is complete, and verified before it is opened.
+"""Trust in stores: their form is checked before zarr opens them; a complete store is sealed, and verified.
 
 A NetCDF store has the seal of `lfpiv.hdf5`. A Zarr store has two digests in its consolidated metadata: one of all bytes
 of all files, and one of everything but the values of the variables. The first is checked for stores of up to
 `WHOLE_BYTES`, the second for larger ones, whose chunks have checksums of their own.
+
+Digests have no key: whoever can write the folder can make them. Codecs of numcodecs can run code that a chunk holds. So
+only numbers behind the filters and the compressor that `lfpiv export` uses are opened, whatever the digests say.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import re
 import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,8 +30,16 @@ WHOLE_BYTES = 4 << 30
 OUTLINE, CONTENT = "outline_digest", "content_digest"
 """Attributes of a Zarr store: digest of names, sizes, metadata and axes, and digest of all bytes."""
 
-_METADATA, _ATTRIBUTES = ".zmetadata", ".zattrs"
+LARGEST_CHUNK = 64 << 20
+"""Largest chunk, and largest coordinate, of a Zarr store [byte]."""
+
+FILTERS, COMPRESSORS = ("shuffle",), ("zstd",)
+"""Codecs of numcodecs that a Zarr store may state."""
+
+_METADATA, _ATTRIBUTES, _ARRAY, _GROUP = ".zmetadata", ".zattrs", ".zarray", ".zgroup"
 _OWN = (_METADATA, _ATTRIBUTES)  # hold the digests
+_NAMES = re.compile(r"\.(zgroup|zattrs|zmetadata)|\w+(/(\.zarray|\.zattrs|\d+(\.\d+)*))?")
+_NUMBERS = re.compile(r"[<|](b1|[iu][1248]|f[248])")
 _FIELD_CHUNK_DOTS = 3  # a chunk of a variable over pair, z, y, x is named as 0.0.0.0
 
 
@@ -73,10 +86,14 @@ def zarr_attributes(path: Path) -> dict[str, Any]:
     DamagedFile
         If they are missing or have another form.
     """
+    return _read(path, _ATTRIBUTES)
+
+
+def _read(path: Path, name: str) -> dict[str, Any]:
     try:
-        return read_object(read_text(path / _ATTRIBUTES))
+        return read_object(read_text(path / name))
     except (FileNotFoundError, RecordError) as error:
-        raise DamagedFile(path, f"{_ATTRIBUTES}: {error}") from None
+        raise DamagedFile(path, f"{name}: {error}") from None
 
 
 def zarr_digests(path: Path, *, whole: bool = True) -> dict[str, str]:
@@ -110,8 +127,56 @@ def zarr_digests(path: Path, *, whole: bool = True) -> dict[str, str]:
     return {OUTLINE: outline.hexdigest()} | ({CONTENT: content.hexdigest()} if whole else {})
 
 
+def check_zarr(path: Path) -> None:
+    """Check the form of a Zarr store, complete or not. No codec runs.
+
+    Raises
+    ------
+    DamagedFile
+        If it holds other files, or states another type, filter, compressor or size than `lfpiv export` writes.
+    """
+    known = zarr_metadata(path)["metadata"]
+    for place, folders, names in os.walk(path):
+        for name in [*folders, *names]:
+            relative = Path(place, name).relative_to(path).as_posix()
+            if not _NAMES.fullmatch(relative) or Path(place, name).is_symlink():
+                raise DamagedFile(path, f"{relative} is no part of such a store")
+            if name in (_ATTRIBUTES, _GROUP):
+                _read(path, relative)
+        if _ARRAY in names:
+            relative = f"{Path(place).name}/{_ARRAY}"
+            if relative not in known:
+                raise DamagedFile(path, f"its metadata do not name {relative}")
+            _check_array(path, relative, _read(path, relative))
+    for relative in known:
+        if relative.endswith(_ARRAY):
+            _check_array(path, relative, known[relative])
+        elif not relative.endswith((_GROUP, _ATTRIBUTES)):
+            raise DamagedFile(path, f"its metadata name {relative}")
+
+
+def _check_array(path: Path, name: str, form: Any) -> None:
+    """Refuse the metadata of an array that `lfpiv export` does not write."""
+    form = form if isinstance(form, dict) else {}
+    filters, compressor = form.get("filters") or [], form.get("compressor") or {}
+    codecs = [*filters, compressor] if isinstance(filters, list) else [None]
+    if not all(isinstance(codec, dict) for codec in codecs):
+        raise DamagedFile(path, f"{name}: its codecs have another form")
+    for codec, allowed in [*((one, FILTERS) for one in filters), (compressor, (*COMPRESSORS, None))]:
+        if (found := codec.get("id")) not in allowed:
+            raise DamagedFile(path, f"{name}: expected the codec {allowed[0]}, found {str(found)[:40]!r}")
+    kind, shape, chunks = form.get("dtype"), form.get("shape"), form.get("chunks")
+    if form.get("zarr_format") != 2 or not isinstance(kind, str) or not _NUMBERS.fullmatch(kind):
+        raise DamagedFile(path, f"{name}: expected numbers in format 2, found {str(kind)[:40]!r}")
+    lengths = [length for one in (shape, chunks) for length in (one if isinstance(one, list) else [None])]
+    if not all(type(length) is int and length >= 0 for length in lengths) or len(shape) != len(chunks):
+        raise DamagedFile(path, f"{name}: its shape or chunks are no lengths")
+    if math.prod(chunks if len(shape) > 1 else map(max, shape, chunks)) * int(kind[2:]) > LARGEST_CHUNK:
+        raise DamagedFile(path, f"{name}: expected at most {LARGEST_CHUNK} bytes at once, found {shape} in {chunks}")
+
+
 def verify_zarr(path: Path) -> None:
-    """Verify a complete Zarr store.
+    """Verify a complete Zarr store, whose form was checked.
 
     Raises
     ------

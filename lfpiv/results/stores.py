@@ -6,12 +6,11 @@ read few chunks. They are written in blocks of one chunk along the pairs, each v
 
 from __future__ import annotations
 
-import errno
+import importlib.metadata
 import importlib.util
 import json
 import logging
 import math
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,9 +21,10 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.files import replacing
+from lfpiv.files import replacing, replacing_folder
 from lfpiv.progress import StepProgress
 from lfpiv.results import datasets, netcdf, store_seal
+from lfpiv.results.folder import locked
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
 
 log = logging.getLogger(__name__)
@@ -41,6 +41,9 @@ CHUNK_NUMBERS = 4096
 FORM = "lfpiv_store"
 """Attribute with the version of the store's layout."""
 LAYOUT = 1
+
+OLDEST_ZARR = 3
+"""Oldest major version of zarr that writes and reads stores."""
 
 COMPLETE, SIGNATURE, CHANGED = "complete", "signature", "file_changed_ns"
 """Attributes of a Zarr store, and its variable with the time of the last change of each vector file [ns]."""
@@ -97,8 +100,9 @@ def _verified(path: Path) -> xr.Dataset:
                 f"{path}: expected a complete store, found that of an export that was interrupted or goes on. The same "
                 "`lfpiv export` goes on from there."
             )
+        store_seal.check_zarr(path)
         store_seal.verify_zarr(path)
-        results = xr.open_zarr(path, consolidated=True, chunks=chunks)
+        results = xr.open_zarr(path, consolidated=True, chunks=chunks, zarr_format=2)
     else:
         with hdf5.glanced(path) as file:
             _require_form(file.attrs, path)
@@ -134,32 +138,32 @@ def write_netcdf(
     Raises
     ------
     OSError
-        If the disk has less space than the next block takes uncompressed: HDF5 does not survive a disk that fills up.
+        If the file cannot be written.
     """
     import h5netcdf
+    from xarray.backends import H5NetCDFStore
 
     pairs, tile = _layout(files)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as scratch:
+    with replacing(path) as scratch, hdf5.written(scratch) as disk, h5netcdf.File(disk, "w") as file:
         for first, after in _blocks(0, len(files), pairs):
             progress(first / len(files))
             block = _with_times(files.block(first, after), interval_s)
-            _require_space(block.nbytes, path)
             if first == 0:
                 packed = datasets.packed(block, {**attributes, FORM: LAYOUT})
                 for variable in packed.variables.values():
                     if variable.dims and variable.dims[0] == files.dimension:
                         chunks = (pairs, *tile) if variable.ndim > 1 else (CHUNK_NUMBERS,)
                         variable.encoding |= {"chunksizes": chunks, "fletcher32": True}
-                packed.to_netcdf(scratch, engine="h5netcdf", unlimited_dims=[files.dimension])
-                continue
-            with h5netcdf.File(scratch, "a") as file:
+                packed.dump_to_store(H5NetCDFStore(file), unlimited_dims=[files.dimension])
+            else:
                 file.resize_dimension(files.dimension, after)
                 for name, variable in block.variables.items():
                     if files.dimension in variable.dims:
                         target = file.variables[str(name)]
                         target[first:after] = variable.values.astype(target.dtype)
-        hdf5.seal(scratch)
+            file.flush()
+            disk.check()
     progress(1.0)
 
 
@@ -177,17 +181,24 @@ def write_zarr(
     Raises
     ------
     InputError
-        If zarr is not installed, or another folder is in the way.
+        If zarr is not installed, another folder is in the way, or another process writes the store.
     OSError
         If the disk is full.
     """
     _require_zarr()
+    with locked(path.with_name(f".{path.name}.lock")):
+        _write_zarr(files, path, attributes, interval_s, progress)
+
+
+def _write_zarr(
+    files: StackedFiles, path: Path, attributes: Mapping[str, Any], interval_s: float | None, progress: StepProgress
+) -> None:
     import zarr
 
     pairs, tile = _layout(files)
     identity = json.dumps([files.signature, interval_s, pairs, tile])
     changed = files.changed_ns()
-    start = _kept(path, identity, files, changed)
+    start = _kept(path, identity, files, changed, pairs)
     own = {**attributes, FORM: LAYOUT, SIGNATURE: identity, COMPLETE: 0}
     if start is None:
         shutil.rmtree(path, ignore_errors=True)
@@ -213,9 +224,13 @@ def write_zarr(
 
 def _seal(zarr: Any, path: Path) -> None:
     """State the digests of a complete Zarr store in its metadata."""
-    choice = {"use_consolidated": False} if _is_plural(zarr) else {}
-    zarr.open_group(str(path), mode="r+", **choice).attrs.update(store_seal.zarr_digests(path))
-    zarr.consolidate_metadata(str(path))
+    _group(zarr, path).attrs.update(store_seal.zarr_digests(path))
+    zarr.consolidate_metadata(str(path), zarr_format=2)
+
+
+def _group(zarr: Any, path: Path) -> Any:
+    """Open a store to write, with the metadata of each array."""
+    return zarr.open_group(str(path), mode="r+", use_consolidated=False, zarr_format=2)
 
 
 def _layout(files: StackedFiles) -> tuple[int, tuple[int, ...]]:
@@ -253,14 +268,16 @@ PAIR_TIME_ATTRIBUTES = {
 """Attributes of the times of image pairs."""
 
 
-def _require_space(need: int, path: Path) -> None:
-    if need > shutil.disk_usage(path.parent).free:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-
 def _require_zarr() -> None:
-    if importlib.util.find_spec("zarr") is None:
-        raise InputError("zarr: expected the package zarr for Zarr stores, found none. `pip install 'lfpiv[zarr]'`.")
+    try:
+        found = importlib.metadata.version("zarr")
+    except importlib.metadata.PackageNotFoundError:
+        found = "none"
+    if not found.partition(".")[0].isdecimal() or int(found.partition(".")[0]) < OLDEST_ZARR:
+        raise InputError(
+            f"zarr: expected the package zarr {OLDEST_ZARR} or newer, which needs Python 3.11, for Zarr stores, found "
+            f"{found}. `pip install 'lfpiv[zarr]'`, or export to netcdf."
+        )
 
 
 def _attributes_of(path: Path) -> dict[str, Any]:
@@ -271,8 +288,11 @@ def _attributes_of(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -> int | None:
-    """Return how many of the files a store already has, from the first on; None if it must be written anew."""
+def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray, length: int) -> int | None:
+    """Return how many of the files a store already has, from the first on; None if it must be written anew.
+
+    Blocks of an unfinished store have `length` pairs.
+    """
     if not path.exists():
         return None
     own = _attributes_of(path) or _plain_attributes(path)
@@ -280,20 +300,32 @@ def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray) -
         raise InputError(f"{path}: expected a place for a Zarr store, found another folder. Remove it, or use --out.")
     if own.get(FORM) != LAYOUT or own.get(SIGNATURE) != identity:
         return None
+    complete = bool(own.get(COMPLETE))
     try:
-        if own.get(COMPLETE):
+        store_seal.check_zarr(path)
+        if complete:
             store_seal.verify_zarr(path)
-    except DamagedFile as error:
-        log.warning("%s: damaged, written anew: %s", path, error.reason)
-        return None
-    try:
-        with xr.open_zarr(path, consolidated=True, chunks=None) as stored:
+        with xr.open_zarr(path, consolidated=True, chunks=None, zarr_format=2) as stored:
             numbers, times = stored[files.dimension].values, stored[CHANGED].values
-    except (OSError, ValueError, KeyError):
+            both = min(len(numbers), len(files))
+            same = (numbers[:both] == np.array(files.numbers)[:both]) & (times[:both] == changed[:both])
+            kept = int(both if same.all() else same.argmin())
+            return kept if complete else _readable(stored, files.dimension, kept, length)
+    except Exception as error:  # readers of damaged stores raise whatever they meet
+        reason = error.reason if isinstance(error, DamagedFile) else f"{type(error).__name__}: {error}"
+        log.warning("%s: damaged, written anew: %s", path, " ".join(reason.split())[:300])
         return None
-    both = min(len(numbers), len(files))
-    same = (numbers[:both] == np.array(files.numbers)[:both]) & (times[:both] == changed[:both])
-    return int(both if same.all() else same.argmin())
+
+
+def _readable(stored: xr.Dataset, dimension: str, kept: int, length: int) -> int:
+    """Return how many pairs an unfinished store has in whole blocks that can be read; it has no digest yet."""
+    whole = kept // length * length
+    for first in range(0, whole, length):
+        try:
+            stored.isel({dimension: slice(first, first + length)}).load()
+        except Exception:  # torn chunks make codecs raise whatever they like
+            return first
+    return whole
 
 
 def _plain_attributes(path: Path) -> dict[str, Any]:
@@ -307,26 +339,24 @@ def _create(
     block: xr.Dataset, path: Path, attributes: Mapping[str, Any], dimension: str, chunks: tuple[int, ...]
 ) -> None:
     """Create the arrays of a store, empty along the pairs."""
-    import zarr
     from numcodecs import Shuffle, Zstd  # type: ignore[import-untyped]
 
     packed = datasets.packed(block.isel({dimension: slice(0, 0)}), attributes)
     packed.attrs = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in packed.attrs.items()}
     encoding: dict[str, dict[str, Any]] = {}
-    plural = _is_plural(zarr)
     for name, variable in packed.variables.items():
         variable.attrs = {key: np.asarray(value).tolist() for key, value in variable.attrs.items()}
         variable.encoding = {}
+        size = 1 if variable.dtype == bool else variable.dtype.itemsize
+        own: dict[str, Any] = {
+            "compressors": (Zstd(level=1, checksum=True),),
+            "filters": [Shuffle(size)] if size > 1 else None,
+        }
         if dimension in variable.dims:
-            code = Zstd(level=1, checksum=True)
-            size = 1 if variable.dtype == bool else variable.dtype.itemsize
-            encoding[str(name)] = {
-                "chunks": chunks if variable.ndim > 1 else (CHUNK_NUMBERS,),
-                "filters": [Shuffle(size)] if size > 1 else None,
-                **({"compressors": (code,)} if plural else {"compressor": code}),
-            }
-    version: Any = {"zarr_format": 2} if plural else {"zarr_version": 2}
-    packed.to_zarr(path, mode="w", consolidated=False, encoding=encoding, **version)
+            own["chunks"] = chunks if variable.ndim > 1 else (CHUNK_NUMBERS,)
+        encoding[str(name)] = own
+    with replacing_folder(path) as scratch:
+        packed.to_zarr(scratch, mode="w", consolidated=False, encoding=encoding, zarr_format=2)
 
 
 def _resize(
@@ -340,8 +370,7 @@ def _resize(
     first: int = 0,
 ) -> None:
     """Set the length of all arrays along the pairs, write a block from `first` on, and consolidate the metadata."""
-    choice = {"use_consolidated": False} if _is_plural(zarr) else {}
-    group = zarr.open_group(str(path), mode="r+", **choice)
+    group = _group(zarr, path)
     group.attrs[COMPLETE] = complete
     for name, array in group.arrays():
         if dimension in array.attrs["_ARRAY_DIMENSIONS"]:
@@ -350,9 +379,4 @@ def _resize(
             if block is not None:
                 array = group[name]
                 array[first:length] = block[name].values.astype(array.dtype)
-    zarr.consolidate_metadata(str(path))
-
-
-def _is_plural(zarr: Any) -> bool:
-    """Return whether this is zarr 3 or newer, which has other names for some arguments."""
-    return int(zarr.__version__.split(".")[0]) >= 3
+    zarr.consolidate_metadata(str(path), zarr_format=2)

@@ -11,15 +11,18 @@ import datetime
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lfpiv.errors import ClusterError, InputError
+from lfpiv.files import remove_leftovers, scratch_path
 from lfpiv.runs.worker_plan import Plan
 
 START_S = 300.0
@@ -30,6 +33,9 @@ SET_BACK_S = 10.0
 """Time by which the clock may be set back during a run [s]; Dask's processes wait for as long before they go on."""
 CLOSE_S = 10.0
 """Time that Dask is given to close [s]."""
+
+LONGEST_FOLDER = 80
+"""Most characters of the folder of a socket. Linux allows 107 for the whole path."""
 
 ROLES = ("client", "scheduler", "worker")
 """Processes that have a certificate in Dask's settings."""
@@ -89,6 +95,7 @@ def start_preloading(kind: str) -> None:
 
     with _settings(kind):
         dask.utils.get_mp_context().set_forkserver_preload(["lfpiv.runs.worker_preload"])  # after Dask's own
+    _choose_folder_of_sockets()
     resource_tracker.ensure_running()  # must start first: it unblocks Ctrl-C
     path = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # the same modules as here
@@ -100,6 +107,20 @@ def start_preloading(kind: str) -> None:
             del os.environ["PYTHONPATH"]
         else:
             os.environ["PYTHONPATH"] = path
+
+
+def _choose_folder_of_sockets() -> None:
+    """Give the sockets of the processes a temporary folder that a later run recognises, should this one be killed."""
+    from multiprocessing import process, util
+
+    place = Path(tempfile.gettempdir())
+    remove_leftovers(place, ".lfpiv.*.tmp")
+    config = process.current_process()._config  # type: ignore[attr-defined]  # where Python keeps its own choice
+    folder = scratch_path(place / "lfpiv")
+    if config.get("tempdir") is None and len(str(folder)) < LONGEST_FOLDER:
+        folder.mkdir(mode=0o700)
+        util.Finalize(None, shutil.rmtree, args=(str(folder), True), exitpriority=-100)
+        config["tempdir"] = str(folder)
 
 
 def _require_connections() -> None:

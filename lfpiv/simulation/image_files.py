@@ -13,6 +13,8 @@ import h5py
 import numpy as np
 import tifffile
 
+from lfpiv import hdf5
+
 FIELDS = {"camera", "instant"}
 """Fields of the path of a series' images."""
 
@@ -102,7 +104,9 @@ class ImageWriter:
 
     def _append_hdf5(self, path: Path, part: str, image: np.ndarray) -> None:
         if path not in self._hdf5:
-            self._hdf5[path] = self._stack.enter_context(h5py.File(path, "w"))
+            disk = self._stack.enter_context(hdf5.Disk(path, "w+"))
+            self._stack.callback(disk.check)
+            self._hdf5[path] = self._stack.enter_context(h5py.File(disk, "w"))
         match = DATASET.fullmatch(part)
         assert match is not None
         file, name, index = self._hdf5[path], match["name"], int(match["index"])

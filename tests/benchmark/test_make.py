@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -155,6 +156,16 @@ def test_an_interrupted_case_leaves_nothing(tmp_path):
     def stop(step, fraction):
         raise KeyboardInterrupt
 
+    with pytest.raises(KeyboardInterrupt):
+        make(["trial"], tmp_path / "data", truth=tmp_path / "secret", progress=stop)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_truth_that_a_killed_command_left_does_not_stop_the_same_command(made, tmp_path):
+    def stop(step, fraction):
+        raise KeyboardInterrupt
+
+    shutil.copytree(made.truth, tmp_path / "secret")
     with pytest.raises(KeyboardInterrupt):
         make(["trial"], tmp_path / "data", truth=tmp_path / "secret", progress=stop)
     assert not list(tmp_path.iterdir())

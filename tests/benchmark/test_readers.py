@@ -1,5 +1,8 @@
 """Vectors in forms of other programs are read right, and whatever is missing or ambiguous is one clear message."""
 
+import tracemalloc
+
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -139,6 +142,31 @@ def test_what_a_file_does_not_say_is_asked_for(truth, tmp_path):
     refused(bare, "u: expected it in m/s, mm/s, mm, m or voxel, found the unit 'furlong'")
     refused(one.assign_attrs(pair=7), "pair 0 to 1 of the data set, found 7")
     refused(one.expand_dims(a=2, b=2), "one dimension beside those of x, y and z, .* found a, b")
+
+
+@pytest.mark.parametrize("storage", ["sparse", "inflating"])
+def test_a_file_that_grows_in_memory_is_not_read(truth, tmp_path, storage):
+    with h5py.File(tmp_path / "result_0.nc", "w") as file:
+        for name in ("x", "y", "z", "u", "v", "w"):
+            file.create_dataset(name, (1 << 28,), "f8", chunks=(1 << 20,), compression="gzip")
+            if storage == "inflating":
+                file[name][: 1 << 20] = 0
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"bytes declare [\d,]+ values"):
+        read_result(tmp_path / "result_0.nc", truth)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 26
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("pair", "first"), ("voxel_mm", "small"), ("window_mm", [1.0, 2.0]), ("seconds", "long"), ("memory_mib", np.nan)],
+)
+def test_attributes_of_another_form_are_named(truth, tmp_path, name, value):
+    vectors = known_truth.true_vectors(truth, 0).assign_attrs(pair=0).assign_attrs({name: value})
+    vectors.to_netcdf(tmp_path / "result.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=f"result.nc: expected .*{name}"):
+        read_result(tmp_path / "result.nc", truth)
 
 
 def test_given_names_and_units_are_used(truth, tmp_path):

@@ -259,6 +259,31 @@ def test_the_command_prints_a_table_and_writes_page_and_json(truth, tmp_path, ca
     assert capfd.readouterr().err.count("\n") == 1
 
 
+def test_a_label_may_look_like_a_formula(truth, tmp_path, capfd):
+    path = both_pairs(truth, tmp_path / "result")
+    page = tmp_path / "score.html"
+    labels = ["--label", r"$\frac{a}$", "--label", "5 $ of _{"]
+    command = ["benchmark", "score", str(truth.folder.parent), str(path), str(path), *labels, "--out", str(page)]
+    assert commands.call(command) == 0, capfd.readouterr().err
+    assert r"$\frac{a}$" in page.read_text("utf-8")
+
+
+def test_a_place_for_the_page_is_asked_for_before_work(tmp_path, capfd):
+    out = tmp_path / "missing" / "score.html"
+    assert commands.call(["benchmark", "score", "no data", "no result", "--out", str(out)]) == 2
+    assert f"no folder {out.parent}. Make it first" in capfd.readouterr().err
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("mark", [1e300, 1e36, -np.inf])
+def test_marks_of_missing_values_are_no_vectors(truth, tmp_path, mark):
+    vectors = known_truth.true_vectors(truth, 0)
+    order = np.arange(vectors["u"].size).reshape(vectors["u"].shape)
+    vectors["v"] = vectors["v"].where(xr.DataArray(order % 2 == 0, dims=("z", "y", "x")), mark)
+    score = score_of(truth, known_truth.write_pairs(tmp_path / "result", [vectors]), pairs=(0, 1))
+    assert values_of(score)["error"] < ROUNDING and values_of(score)["completeness"] == pytest.approx(0.5, abs=0.03)
+
+
 def test_every_figure_of_a_score_is_defined(truth, tmp_path):
     score = score_of(truth, both_pairs(truth, tmp_path / "result"))
     defined = [key for figure in all_figures() for key in keys_of(figure)]

@@ -3,6 +3,9 @@
 import importlib.util
 import json
 import os
+import pickle
+import resource
+import shutil
 import tracemalloc
 
 import numpy as np
@@ -264,6 +267,118 @@ def test_a_forged_store_is_refused_and_written_anew(tmp_path, form, forge, whole
         lfpiv.open_results(path)
     lfpiv.export_results(tmp_path, form)
     xr.testing.assert_identical(lfpiv.open_results(path).load(), wanted)
+
+
+class Touch:
+    """An object whose pickle makes a file where it is read."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return open, (str(self.mark), "w")
+
+
+PICKLE = {"id": "pickle"}
+OBJECTS = {"filters": [{"id": "vlen-utf8"}], "compressor": PICKLE, "dtype": "|O", "fill_value": ""}
+
+
+def state(store, name, change):
+    """Change what a store states of an array, or of itself, in both places."""
+    every = json.loads((store / ".zmetadata").read_text())
+    every["metadata"][name] |= change
+    (store / name).write_text(json.dumps(every["metadata"][name]))
+    (store / ".zmetadata").write_text(json.dumps(every))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("x", OBJECTS, "expected the codec"),
+        ("pair", OBJECTS, "complete store"),
+        ("pair", {"compressor": PICKLE}, "expected the codec zstd, found 'pickle'"),
+        ("file_changed_ns", {"filters": [PICKLE]}, "expected the codec shuffle, found 'pickle'"),
+        ("pair", {"dtype": "|O"}, "expected numbers"),
+        ("pair", {"shape": [1 << 40]}, "bytes at once"),
+    ],
+)
+def test_no_codec_runs_that_an_export_does_not_write(tmp_path, name, change, said):
+    pytest.importorskip("zarr")
+    write_run(tmp_path, NUMBERS[:3])
+    (path,) = lfpiv.export_results(tmp_path, "zarr")
+    wanted = lfpiv.open_results(path).load()
+    state(path, f"{name}/.zarray", change)
+    for chunk in (path / name).glob("[0-9]*"):
+        chunk.write_bytes(pickle.dumps(Touch(tmp_path / "ran")))
+    state(path, ".zattrs", store_seal.zarr_digests(path) | {"complete": int(said != "complete store")})
+    with pytest.raises(lfpiv.InputError, match=said):
+        lfpiv.open_results(path)
+    lfpiv.export_results(tmp_path, "zarr")
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), wanted)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("other", ["zarr.json", "x/c/0"])
+def test_a_store_holds_nothing_but_its_arrays(tmp_path, other):
+    """Zarr would take metadata of format 3 beside those of format 2."""
+    pytest.importorskip("zarr")
+    write_run(tmp_path, NUMBERS[:1])
+    (path,) = lfpiv.export_results(tmp_path, "zarr")
+    (path / other).parent.mkdir(exist_ok=True)
+    (path / other).write_text("{}")
+    state(path, ".zattrs", store_seal.zarr_digests(path))
+    with pytest.raises(lfpiv.InputError, match="no part of such a store"):
+        lfpiv.open_results(path)
+
+
+@pytest.mark.parametrize("torn", ["u/1.0.0.0", "pair/0", "u/.zarray", "x/.zattrs"])
+def test_an_unfinished_store_with_torn_files_is_finished(tmp_path, torn, monkeypatch):
+    pytest.importorskip("zarr")
+    monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
+    write_run(tmp_path, NUMBERS[:3])
+    (path,) = lfpiv.export_results(tmp_path, "zarr")
+    state(path, ".zattrs", {"complete": 0})
+    content = (path / torn).read_bytes()
+    (path / torn).write_bytes(content[: len(content) // 2])
+    write_run(tmp_path, NUMBERS)
+    lfpiv.export_results(tmp_path, "zarr")
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
+
+
+def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypatch):
+    """HDF5 would crash the process. No disk, but files that may not grow: all of them, or only the last bytes."""
+    write_run(tmp_path, NUMBERS)
+    (path,) = lfpiv.export_results(tmp_path, form)
+    largest = max(file.stat().st_size for file in (path.rglob("*") if path.is_dir() else [path]))
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for size in (0, largest // 3, largest - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            with pytest.raises(lfpiv.errors.StorageError, match="cannot be written: file too large"):
+                lfpiv.export_results(tmp_path, form)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        left = list((tmp_path / "export").iterdir()) if (tmp_path / "export").exists() else []
+        assert left in ([], [path] if form == "zarr" else [])
+    lfpiv.export_results(tmp_path, form)
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
+
+
+def test_two_exports_do_not_write_one_zarr_store(tmp_path, monkeypatch):
+    pytest.importorskip("zarr")
+    write_run(tmp_path, NUMBERS[:2])
+    inner = stacked_files.StackedFiles.block
+
+    def export_too(self, first, after):
+        monkeypatch.setattr(stacked_files.StackedFiles, "block", inner)
+        with pytest.raises(lfpiv.InputError, match=f"held by process {os.getpid()}"):
+            lfpiv.export_results(tmp_path, "zarr")
+        return inner(self, first, after)
+
+    monkeypatch.setattr(stacked_files.StackedFiles, "block", export_too)
+    (path,) = lfpiv.export_results(tmp_path, "zarr")
+    assert lfpiv.open_results(path).sizes["pair"] == 2 and [path] == list(path.parent.iterdir())
 
 
 def test_pairs_and_a_series_in_one_folder_are_refused(tmp_path):
