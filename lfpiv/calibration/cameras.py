@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from lfpiv.calibration import checks, contradictions
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
-from lfpiv.calibration.board.errors import BoardErrors
+from lfpiv.calibration.board.errors import KINDS, BoardErrors
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -182,13 +182,14 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
 
 def _log_board(errors: BoardErrors) -> None:
     if not errors.corrected:
-        log.info("board: no significant errors of its planes and dots; it is used as stated")
+        log.info("board: its dots show no errors of planes or dots that exceed chance; it is used as stated")
         return
-    off = ", ".join(
-        f"{1e3 * error:+.1f} ({1e3 * std:.1f})"
-        for error, std in zip(errors.plane[:, 2], errors.plane_std[:, 2], strict=True)
-    )
-    log.info("board: errors corrected of %s; planes off along z [um] (standard error): %s", errors.corrected, off)
+    text = f"board: errors found and corrected: {', '.join(KINDS[kind] for kind in errors.corrected)}"
+    if "depth" in errors.corrected:
+        off, std = 1e3 * errors.plane[:, 2], 1e3 * errors.plane_std[:, 2]
+        worst = int(np.abs(off).argmax())
+        text += f"; planes stand up to {abs(off[worst]):.2g} um off along z (standard error {std[worst]:.2g} um)"
+    log.info("%s", text)
 
 
 def _calibrate_camera(
@@ -212,8 +213,8 @@ def _calibrate_camera(
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
     log.info(
-        "%s: %d of %d dots, sigma_nor %.4f pitch on held-out dots, %.4f with the board as stated",
-        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test, quality.sigma_nor_stated,
+        "camera %s: calibrated with %d of %d dots; at dots that were held back, rays are off by %.2g microlens pitches",
+        setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
     )  # fmt: skip
     step(1.0)
     used = dots.points_mm[mapping.agreeing]

@@ -179,8 +179,9 @@ def find_lens_array(
         sensor_shape=image.shape,
     )
     log.info(
-        "%s lens array: %d microimages, pitch %.4f px, rotation %.4f degrees, %d measured, rms %.4f px",
-        layout, len(index), array.pitch_px, array.rotation_deg, measured, rms,
+        "white image: %d of %d microimages measured, %.4f px apart on a %s lattice turned by %.3f degrees; they lie "
+        "%.2g px (rms) off it",
+        measured, len(index), array.pitch_px, layout, array.rotation_deg, rms,
     )  # fmt: skip
     return array
 

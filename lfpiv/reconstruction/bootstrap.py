@@ -95,7 +95,9 @@ def measure_damping(
         raise ValueError("vectors, images: expected those of at least one pair with valid vectors, got none.")
     recorded = RecordedImages(weights, LightField(weights.grid, volume))
     particles = recorded.particles(images, _noise(images) if noise is None else noise)
-    text = "particles like the recorded ones: %.4f per voxel, standard deviation %.2f voxel"
+    text = (
+        "damping by ghosts: pairs are simulated with particles like the recorded ones, %.2g per voxel, %.2f voxel wide"
+    )
     log.info(text, particles.density, particles.sigma_voxel)
     return _Bootstrap(recorded, particles, measure, usable).run(int(pairs), progress or (lambda fraction: None))
 

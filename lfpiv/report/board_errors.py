@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfpiv.calibration.board.errors import BoardErrors
+from lfpiv.calibration.board.errors import KINDS, BoardErrors
 from lfpiv.report import markup
 from lfpiv.report.markup import number
 from lfpiv.report.svg import INK, SERIES, new_panel, spread_ticks, style, to_svg
@@ -25,14 +25,6 @@ TITLES = (
     "± [mrad]",
 )
 """Columns of the table."""
-NAMES = {
-    "depth": "depths of the planes",
-    "shift": "shifts of the planes",
-    "tilt": "tilts of the planes",
-    "rotation": "turns of the planes about z",
-    "dots": "places of the dots on the board",
-}
-"""What the kinds of errors are called."""
 
 
 def board_part(board: BoardErrors) -> str:
@@ -56,7 +48,7 @@ def _text(board: BoardErrors) -> str:
     if not len(seen):
         found = "There are too few planes or dots to tell errors of the board from the lens: it is used as stated."
     elif board.corrected:
-        names = ", ".join(NAMES[kind] for kind in board.corrected)
+        names = ", ".join(KINDS[kind] for kind in board.corrected)
         scatter = float(np.sqrt(np.mean(board.dot_mm**2)))
         dots = f" Dots lie {1e3 * scatter:.1f} µm (rms, along x and y) off their places." if scatter else ""
         found = f"The labels of all cameras show errors of the board, which are corrected: {names}.{dots}"

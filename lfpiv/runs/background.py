@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LEAST_STRAY = 0.05
+"""Least stray light that is told [counts]; less rounds to nothing."""
 LARGE_SHARE = 0.02
 """Share of an image's light that stands still and is not subtracted, above which a warning is due."""
 LONGEST_SERIES = 32
@@ -262,15 +264,10 @@ def _log_series(experiment: Experiment, name: str, light: StandingLight, count: 
     frames = "both frames" if light.ratio is not None else "each frame"
     if experiment.series is None:
         images = f"{frames} of {images}"
-    log.info(
-        "background of %s: estimated from %s; light stands in %.1f %% of the sensor, %d pixels are "
-        "unusable, stray light of %.1f counts",
-        name,
-        images,
-        100 * light.region.mean(),
-        np.count_nonzero(light.unusable),
-        light.stray,
-    )
+    parts = [f"light stands still in {100 * light.region.mean():.2g} % of the sensor"] if light.region.any() else []
+    parts += [f"stray light of {light.stray:.2g} counts lies on all pixels"] if light.stray > LEAST_STRAY else []
+    parts += [f"{np.count_nonzero(light.unusable)} pixels saturate in it"] if light.unusable.any() else []
+    log.info("background of %s, estimated from %s and subtracted: %s", name, images, "; ".join(parts))
 
 
 def _without_dark(

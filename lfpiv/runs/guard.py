@@ -114,7 +114,8 @@ def decide(
     demanded = _demanded(experiment, faces)
     allowed = _fitting(experiment, demanded)
     guard = Guard(pairs=tuple(instants), faces=faces, layers=allowed, short=allowed != demanded)
-    log.info("light beyond the volume: measured in %.1f s", time.perf_counter() - start)
+    found_text = ", ".join(_name(experiment, face) for face in faces) or "none"
+    log.info("faces of the volume with light beyond them: %s (%.1f s)", found_text, time.perf_counter() - start)
     stamp = stamps.of_guard(experiment, stamp_hash, guard.pairs, background)
     stored_outcome.write({"guard": guard.to_json()}, stamp, folder.guard)
     return guard

@@ -60,7 +60,8 @@ def weights_bytes(experiment: Experiment, particle_voxel: float = 0.0) -> int:
     cameras, grid, form = nominal_cameras(experiment), experiment.grid, weights_form(experiment)
     weights = estimate_memory(cameras, grid, form, particle_voxel)
     if form == "auto" and (most := estimate_memory(cameras, grid, "pixels", particle_voxel)) > weights:
-        log.info("memory: %s for weights, up to %s where rays bend", size_text(weights), size_text(most))
+        text = "memory: weights need %s, at most %s with strong aberrations"
+        log.info(text, size_text(weights), size_text(most))
     return weights
 
 

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+POINT_VOXEL = 0.05
+"""Size of particles below which the images do not distinguish them from points [voxel]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Refinement:
@@ -145,8 +148,13 @@ def _fitting(experiment: Experiment, demanded: float, size_voxel: float) -> floa
 
 def _log(experiment: Experiment, found: Refinement, seconds: float) -> None:
     """Log the size of the particles and the price of the refinement."""
-    size = "cannot be measured" if found.size_voxel is None else f"{found.size_voxel:.2f} voxel"
-    log.info("size of the particles: %s, measured in %.1f s", size, seconds)
+    if found.size_voxel is None:
+        size = "cannot be measured in these images"
+    elif found.size_voxel < POINT_VOXEL:
+        size = "too small to be measured; they are taken for points"
+    else:
+        size = f"{found.size_voxel:.2f} voxel (standard deviation of a blob)"
+    log.info("size of the particles: %s (%.1f s)", size, seconds)
     if found.factor > 1:
         more, edge = found.factor**3, experiment.grid.voxel_mm / found.factor
         log.info("volumes are reconstructed on voxels of %.3g mm: %.1f times as many as are written", edge, more)

@@ -242,7 +242,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
     errors = [error for camera in counted.values() for error in camera]
     if errors:  # a camera may see none of the voxels that were drawn
         share = 100 * np.mean(errors)
-        log.info("weights differ from a converged count of rays by %.1f %% (mean of %d voxels)", share, len(errors))
+        log.info("weights differ from counted rays by %.1f %% (mean of %d voxels)", share, len(errors))
     return weights, WeightsFigures(
         method=compute.weights,
         memory_mib=weights.memory_bytes / MIB,

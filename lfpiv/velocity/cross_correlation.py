@@ -25,6 +25,8 @@ from lfpiv.velocity.volume_pair import VoxelAxes, moves_beyond
 
 log = logging.getLogger(__name__)
 
+LEAST_TOLD = 0.005
+"""Least part of the volume without particles that is told; less rounds to nothing."""
 GOOD_SHARE = 0.8
 """Smallest part of valid vectors of a good measurement."""
 POOR_SHARE = 0.3
@@ -182,7 +184,7 @@ def correlate(
         if moves_beyond(pair.first, pair.second, first_search):
             verdict = Verdict.TOO_FAR
         log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
-    if voxels.unseeded is not None:
+    if voxels.unseeded is not None and voxels.unseeded_fraction >= LEAST_TOLD:
         log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)
     attributes = {
         "title": f"displacement {'' if dt_s is None else 'and velocity '}of particles between two volumes",

@@ -86,12 +86,14 @@ def choose_form(counted: CountedVoxels) -> Choice:
         pixels = form_errors(counted, "pixels", cuts)
         if np.mean(pixels) <= PIXELS_GAIN * np.mean(profiles):
             choice, errors = Choice(form="pixels", cuts=cuts, profile_errors=tuple(profiles)), pixels
-        log.info("%s: pixel by pixel weights differ by %.1f %%", counted.camera.name, 100 * np.mean(pixels))
+        text = "weights of camera %s pixel by pixel differ from counted rays by %.1f %%"
+        log.info(text, counted.camera.name, 100 * np.mean(pixels))
     if profiles:
         log.info(
-            "%s: profiles differ from counted rays by %.1f %% (worst voxel %.1f %%): weights %s",
+            "weights of camera %s as products of profiles differ from counted rays by %.1f %% (worst voxel %.1f %%): "
+            "they are stored %s",
             *(counted.camera.name, 100 * np.mean(profiles), 100 * max(profiles)),
-            "as products of profiles" if choice.form == "profiles" else "pixel by pixel",
+            "so" if choice.form == "profiles" else "pixel by pixel",
         )
     warn_of_errors(counted, choice.form, errors, requested=False)
     return choice
@@ -102,7 +104,8 @@ def choose_uncounted(stored: StoredGrid, camera: CalibratedCamera, form: str) ->
     if form == "profiles":
         return Choice(form="profiles")
     if form == "auto":
-        log.info("%s: weights pixel by pixel: profiles need a square microlens layout", camera.name)
+        text = "weights of camera %s are stored pixel by pixel: products of profiles need square microlenses"
+        log.info(text, camera.name)
     return Choice(form="pixels", cuts=choose_cuts(stored, camera))
 
 
@@ -153,7 +156,7 @@ def choose_cuts(stored: StoredGrid, camera: CalibratedCamera) -> Cuts:
     else:
         cuts = CUTS[-1]
     if cuts != WHOLE:
-        text = "%s: voxels lie oblique to the microlenses: footprints of %d x %d x %d parts along x, y, z are added"
+        text = "camera %s sees voxels obliquely: their weights are sums over %d x %d x %d parts along x, y, z"
         log.info(text, camera.name, *cuts)
     return cuts
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
+from lfpiv.files import size_text
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
 from lfpiv.progress import StepProgress, part_of
@@ -414,5 +415,5 @@ def build_weights(
     if finished is not None:
         shutil.rmtree(finished, ignore_errors=True)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
-    log.info("weights of %d voxels on %d cameras: %.0f MiB", grid.size, len(cameras), weights.memory_bytes / 2**20)
+    log.info("weights: %d voxels, %d cameras, %s", grid.size, len(cameras), size_text(weights.memory_bytes))
     return weights

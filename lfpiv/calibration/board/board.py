@@ -155,7 +155,7 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
     misfit = np.linalg.norm(mean - np.median(mean[neighbour[:, 1:]], axis=1), axis=1)
     bad = misfit > max(OUTLIER * NORMAL_MAD * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
     if bad.any():
-        log.info("%d dots disagree with their neighbours and are left out: %s", bad.sum(), number[bad].tolist())
+        log.info("%d dots lie elsewhere than their neighbours demand and are left out", bad.sum())
     good: np.ndarray = ~bad[inverse]
     return good
 
@@ -172,5 +172,6 @@ def _count(labels: Labels, board: DotBoard, detection: Detection) -> BoardDots:
         rejected=np.bincount(labels.rejected_dot // board.size, minlength=planes),
         **vars(labels),
     )
-    log.info("board: %d of %d dots measured, %d rejected", found.sum(), dots.expected.sum(), dots.rejected.sum())
+    text = "board images: %d of the %d dots in view measured, %d others left out as no dots"
+    log.info(text, found.sum(), dots.expected.sum(), dots.rejected.sum())
     return dots

@@ -115,7 +115,8 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
         ratio = found @ total @ found / len(start) / (scatter / freedom)
         if float(stats.f.sf(ratio, len(start), freedom)) < _CHANCE:
             bend = found
-            log.info("third-order bend of the rays: %.3f pitch (rms at the pupil's edge)", _edge(bend) / pitch_mm)
+            text = "aberrations bend rays at the rim of the main lens by %.2g microlens pitches (rms)"
+            log.info(text, _edge(bend) / pitch_mm)
     return replace(shared, bend_mm=bend.reshape(2, BENDS).T)
 
 

@@ -21,6 +21,16 @@ COMPONENTS = {"depth": (2,), "shift": (0, 1), "tilt": (3, 4), "rotation": (5,)}
 """Components of a plane's six errors of each kind."""
 
 
+KINDS = {
+    "depth": "depths of the planes",
+    "shift": "shifts of the planes",
+    "tilt": "tilts of the planes",
+    "rotation": "turns of the planes about z",
+    "dots": "places of the dots on the board",
+}
+"""What the kinds of errors are called."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardErrors:
     """Errors of a board, fitted to the labels of all cameras, with standard errors."""
