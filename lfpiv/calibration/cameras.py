@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.calibration import checks, contradictions
+from lfpiv.calibration import checks, contradictions, scales
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import KINDS, BoardErrors
@@ -176,6 +176,7 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
     pitch = min(setup.optics.microlens_pitch_mm / abs(setup.optics.magnification) for setup in experiment.cameras)
     _log_board(errors)
     with collected() as warnings:
+        scales.check_scales(experiment, cameras)
         checks.check_board(errors, board, pitch)
     return replace(errors, warnings=tuple(warnings))
 

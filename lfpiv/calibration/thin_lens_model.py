@@ -186,11 +186,11 @@ def fit_thin_lens(
     start = _linear_start(points, pupil, array, optics)
 
     def residual_of(parameters: np.ndarray) -> np.ndarray:
-        deviation = _moved(start, optics, parameters)(points, pupil) - array
+        deviation = moved(start, parameters)(points, pupil) - array
         residual: np.ndarray = (deviation / std[:, None]).ravel()
         return residual
 
-    return _moved(start, optics, _robust_minimum(residual_of))
+    return moved(start, robust_minimum(residual_of))
 
 
 def _check_labels(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, std: np.ndarray) -> None:
@@ -209,23 +209,23 @@ def _check_labels(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, std:
         raise ValueError(f"std: expected {count} positive finite values, one per label, got shape {std.shape}.")
 
 
-def _robust_minimum(residual_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return the eleven parameters of `_moved` with the least robust cost, by damped Gauss-Newton steps."""
+def robust_minimum(residual_of: Callable[[np.ndarray], np.ndarray], prior: np.ndarray = PRIOR) -> np.ndarray:
+    """Return the parameters with the least robust cost, by damped Gauss-Newton steps; those of `moved` come first."""
 
     def cost(residual: np.ndarray, parameters: np.ndarray, sigma: float) -> float:
         robust = residual**2 / (1 + (residual / (OUTLIER * sigma)) ** 2)
-        return float(robust.sum() + ((sigma / PRIOR * parameters) ** 2).sum())
+        return float(robust.sum() + ((sigma / prior * parameters) ** 2).sum())
 
-    parameters, damping = np.zeros(PRIOR.size), FIRST_DAMPING
+    parameters, damping = np.zeros(prior.size), FIRST_DAMPING
     residual = residual_of(parameters)
     for _ in range(ITERATIONS):
         sigma = max(NORMAL_MAD * float(np.median(np.abs(residual))), SMALLEST_STD_MM)
         weight = 1 / (1 + (residual / (OUTLIER * sigma)) ** 2) ** 2
-        steps = STEP * np.eye(PRIOR.size)
+        steps = STEP * np.eye(prior.size)
         jacobian = np.stack([(residual_of(parameters + step) - residual) / STEP for step in steps], axis=1)
         weighted = jacobian * weight[:, None]
-        gram = weighted.T @ jacobian + np.diag((sigma / PRIOR) ** 2)
-        gradient = weighted.T @ residual + (sigma / PRIOR) ** 2 * parameters
+        gram = weighted.T @ jacobian + np.diag((sigma / prior) ** 2)
+        gradient = weighted.T @ residual + (sigma / prior) ** 2 * parameters
         present = cost(residual, parameters, sigma)
         while True:  # a step along badly determined parameters can leave the range where the model is linear
             step = np.linalg.solve(gram + damping * np.diag(gram.diagonal()), -gradient)
@@ -240,21 +240,20 @@ def _robust_minimum(residual_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarr
     return parameters
 
 
-def _moved(start: ThinLensModel, optics: Optics, p: np.ndarray) -> ThinLensModel:
-    """Return `start` changed by eleven parameters of order 0.01.
+def moved(lens: ThinLensModel, p: np.ndarray) -> ThinLensModel:
+    """Return a lens changed by eleven parameters of order 0.01.
 
-    They are a rotation (3), a shift (3), image distance, focal length and pupil scale relative to the data sheet (3),
-    and the optical axis on the array (2).
+    They are a rotation (3), a shift (3), relative changes of image distance, focal length and pupil scale (3), and the
+    shift of the optical axis on the array (2).
     """
-    focus = optics.image_distance_mm
-    return ThinLensModel(
-        rotation=_rotation(p[:3]) @ start.rotation,
-        offset_mm=start.offset_mm + 10.0 * p[3:6],
-        object_distance_mm=optics.object_distance_mm,
-        image_distance_mm=focus * (1 + p[6]),
-        focal_length_mm=optics.focal_length_mm * (1 + p[7]),
-        pupil_scale=1 + p[8],
-        array_offset_mm=10.0 * p[9:11],
+    return replace(
+        lens,
+        rotation=_rotation(p[:3]) @ lens.rotation,
+        offset_mm=lens.offset_mm + 10.0 * p[3:6],
+        image_distance_mm=lens.image_distance_mm * (1 + p[6]),
+        focal_length_mm=lens.focal_length_mm * (1 + p[7]),
+        pupil_scale=lens.pupil_scale * (1 + p[8]),
+        array_offset_mm=lens.array_offset_mm + 10.0 * p[9:11],
     )
 
 

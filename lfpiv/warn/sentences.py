@@ -39,6 +39,7 @@ class Code(enum.Enum):
     TURNED = "turned"
     MAGNIFIED = "magnified"
     MEDIUM = "medium"
+    SCALES = "scales"
     FEW_LABELS = "few_labels"
     MAPPING_ERROR = "mapping_error"
     # cameras and volume
@@ -174,6 +175,9 @@ SENTENCES: Mapping[Code, str] = {
         "the board looks {depth:.2f} times as deep as stated. That is right in a medium of the refractive index "
         "{index:.2f}, such as water (1.33), and the calibration holds. Otherwise check board.planes_mm, "
         "focal_length_mm and f_number: depth and w depend on the planes."
+    ),
+    Code.SCALES: (
+        "the board's planes and dots contradict each other: {found}. {remedy}. Velocities are wrong by as much"
     ),
     Code.FEW_LABELS: (
         "{dots} dots give the network {values} values for its {parameters} parameters, so it can be wrong between "
