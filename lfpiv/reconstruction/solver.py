@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.volume import checked_mask
+from lfpiv.reconstruction.depth_spread import rows_resolve_depth
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.normalisation import Normalisation
@@ -121,7 +122,9 @@ class SmartSolver:
         if not all(self._sees_alone(name) for name in self.weights.cameras):
             sets = 1
         if self.weights.has_ray_rows and sets > 1:
-            count = wanted if not isinstance(wanted, str) else sets if self.settings.allows_subsets else 1
+            count = wanted
+            if isinstance(wanted, str):
+                count = sets if self.settings.allows_subsets and rows_resolve_depth(self.weights) else 1
             if count > sets:
                 raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {count}.")
             return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)

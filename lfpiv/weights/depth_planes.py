@@ -27,6 +27,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from lfpiv.weights.blocks import WHOLE, Cuts, PackedCamera, blocks_of
@@ -217,10 +218,13 @@ class NodeGrid:
             yield model
 
 
-def line_of_sight(camera: CalibratedCamera, point_mm: np.ndarray) -> np.ndarray:
-    """Return the direction (x, y, z) along which the chief ray's place on the microlens array does not change."""
+def line_of_sight(camera: CalibratedCamera, point_mm: np.ndarray, pupil_mm: ArrayLike = (0.0, 0.0)) -> np.ndarray:
+    """Return the direction (x, y, z) along which the place of a ray on the microlens array does not change.
+
+    The ray crosses the pupil at `pupil_mm` (u, v); default: the chief ray.
+    """
     step = 0.5 * np.eye(3)
-    places = camera.map(np.concatenate([point_mm + step, point_mm - step]), np.zeros((6, 2)))
+    places = camera.map(np.concatenate([point_mm + step, point_mm - step]), np.tile(pupil_mm, (6, 1)))
     direction: np.ndarray = np.linalg.svd(np.asarray(places[:3] - places[3:], float).T)[2][2]
     return direction
 
