@@ -120,13 +120,12 @@ def _element(text: str, name: str) -> str:
 
 
 def _interval_s(rate: str, step: str) -> float | None:
-    """Return the time between the stored images, of which one in `step` was saved; None where it is not stated [s]."""
+    """Return the time between the stored images; None where it is not stated, or images were left out on saving [s]."""
     try:
         images_per_s = float(rate)
     except ValueError:
         return None
-    every = int(step) if step.isascii() and step.isdigit() and len(step) < 10 else 1
-    return max(every, 1) / images_per_s if 1e-3 < images_per_s < 1e9 else None
+    return 1 / images_per_s if 1e-3 < images_per_s < 1e9 and step in ("", "0", "1") else None
 
 
 def _number(header: Mapping[str, str], key: str) -> int:
