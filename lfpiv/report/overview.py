@@ -179,10 +179,8 @@ def _weights(weights: WeightFigures) -> str:
 
 
 def _agreement(weights: WeightFigures, noun: str) -> str:
-    """State the disparity between the cameras, and how self-calibration changed it."""
-    text = ""
-    if weights.disparity_voxel is not None:
-        text = f"particles of {noun} {weights.disparity_pair} within {weights.disparity_voxel:.2f} voxel"
+    """State whether the images of the cameras belong together, and how self-calibration changed the cameras."""
+    text = weights.cameras
     corrected = weights.self_calibration
     if corrected is not None and corrected.verdict != "corrected":
         pairs = markup.count(len(corrected.pairs), noun)

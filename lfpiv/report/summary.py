@@ -58,8 +58,7 @@ class WeightFigures(_Figures):
     memory_mib: float = 0.0
     form: dict[str, str] = {}
     count_check_l2: tuple[float, ...] = ()
-    disparity_pair: int | None = None
-    disparity_voxel: float | None = None
+    cameras: str = ""
     self_calibration: SelfCalibration | None = None
 
 

@@ -59,7 +59,7 @@ class PairVolumes:
     names: tuple[str, str] = ("a", "b")
     """Names of the frames in the experiment; those of a series are "a" and "b"."""
     between: tuple[Warning, ...] = ()
-    """Warnings about both instants of a pair of a series."""
+    """Warnings about both instants of a pair of a series, and refusals of the pair."""
 
     @property
     def volumes(self) -> tuple[xr.DataArray, xr.DataArray]:

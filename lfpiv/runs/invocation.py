@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from lfpiv.runs.moved_cameras import CameraDisparity, SelfCalibrationFigures
+from lfpiv.runs.belonging import Agreement
+from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.warn import Warning
 
@@ -34,7 +35,7 @@ class WeightsFigures:
     seconds: float
     """Time that building them took [s]."""
     warnings: tuple[Warning, ...]
-    disparity: CameraDisparity | None
+    agreement: Agreement
     forms: Mapping[str, str]
     """Camera -> form of its weights; empty for counted weights."""
     cuts: Mapping[str, Sequence[int]]
@@ -54,9 +55,11 @@ class WeightsFigures:
         }
         if self.self_calibration is not None:
             stored["self_calibration"] = self.self_calibration.to_json()
-        if self.disparity is not None:
-            stored |= {"disparity_voxel": self.disparity.voxel, "disparity_pair": self.disparity.pair}
-            stored["disparity_std_voxel"] = self.disparity.std_voxel
+        stored["cameras"] = self.agreement.sentence
+        stored["refusals"] = [warning.to_json() for warning in self.agreement.refusals]
+        if (disparity := self.agreement.disparity) is not None:
+            stored |= {"disparity_voxel": disparity.voxel, "disparity_pair": disparity.pairs[0]}
+            stored["disparity_std_voxel"] = disparity.std_voxel
         stored["count_check_l2"] = [error for errors in self.count_errors.values() for error in _rounded(errors)]
         if self.method == "footprint":
             stored |= {"form": dict(self.forms), "cuts": dict(self.cuts)}

@@ -166,8 +166,8 @@ def prepare(
         current, prepared = rig.prepare(current, calibration)
         finest = current.reconstructed_experiment
         worker_plan.require_memory(finest, memory.weights_bytes(finest, current.particle_voxel), 1)
-        weights, _ = rig.build_weights(current, prepared, current.numbers[:1])
-        work = rig.pair_work(current, weights, keep_volumes=False)
+        weights, figures = rig.build_weights(current, prepared, current.numbers[:1])
+        work = rig.pair_work(current, weights, keep_volumes=False, figures=figures)
         return Rig(
             experiment=current.experiment,
             calibration=prepared.calibration,

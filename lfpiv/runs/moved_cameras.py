@@ -7,10 +7,9 @@ far apart the cameras show the same particles; `correct` fits the movements of t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,9 +18,9 @@ from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import frame_light, read_darks
-from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes, still_light, unlinked, without_still_light
+from lfpiv.selfcalibration.disparity import CameraVolumes, still_light, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
-from lfpiv.warn import Code, Warning, name_pairs, warn
+from lfpiv.warn import Code, Warning, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -34,14 +33,8 @@ log = logging.getLogger(__name__)
 LARGE_VOXEL = 0.25
 """Disparity of the cameras across their lines of sight above which `check` warns [voxel]."""
 
-TRIED = 3
-"""Largest number of pairs that `check` uses. One is enough if it shows clearly whether the disparity is large."""
-
 FRAMES = 2
 """Instants of a pair."""
-
-LEAST_FOR_NOTHING = 2
-"""Least number of pairs without common particles that a warning of it needs."""
 
 LIKE = 0.5
 """Least share of the movements shown by all pairs together in those that a pair shows alone, of pairs that agree."""
@@ -119,8 +112,8 @@ class CameraDisparity:
     voxel: float
     std_voxel: float
     """Standard error of `voxel`."""
-    pair: int
-    """First pair that it was measured with."""
+    pairs: tuple[int, ...]
+    """Pairs that it was measured with."""
 
 
 def correct(
@@ -130,9 +123,14 @@ def correct(
 
     It stays the board's where the images do not show how cameras moved; the figures say why.
     """
-    shown, used, images = _ShownParticles(experiment, calibration.cameras), list[int](), list[dict[str, np.ndarray]]()
-    for pair, moving in shown.without_still_light(experiment.self_calibration_pairs):
-        images += moving
+    shown = ShownParticles(experiment, calibration.cameras, experiment.self_calibration_pairs)
+    used, images = list[int](), list[Mapping[str, np.ndarray]]()
+    for pair in shown.pairs:
+        try:
+            images += shown.pair(pair)
+        except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("self-calibration without pair %d: %s", pair, error)
+            continue
         used.append(pair)
     try:
         found = self_calibrate(calibration, experiment.grid, images, progress=progress)
@@ -153,20 +151,17 @@ def correct(
     )
 
 
-def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> CameraDisparity | None:
+def check(shown: ShownParticles, weights: Weights) -> CameraDisparity | Sequence[int]:
     """Measure how far apart the cameras show the same particles; warn if it is far.
 
-    Uses one pair after another, `pairs` first, until the answer is clear. Return None if there is one camera only, if
-    no pair shows particles, or if the cameras show none in common. Warn in the last case if several pairs agree on it.
+    Uses one pair after another until the answer is clear. Return the pairs that show clear particles and none in common
+    if that is all there is.
     """
-    if len(weights.cameras) < 2:
-        return None
-    shown, volumes, used = _ShownParticles(experiment, weights.cameras), CameraVolumes(weights), list[int]()
-    fit, lost, losses, clear = None, list[str](), 0, True
-    limit_mm = LARGE_VOXEL * experiment.grid.voxel_mm
-    tried = list(islice(experiment.disjoint(chain(pairs, experiment.numbers)), TRIED))
-    for pair, light in shown.without_still_light(tried):
+    experiment, volumes, used, fit = shown.experiment, CameraVolumes(weights), list[int](), None
+    nothing, limit_mm = list[int](), LARGE_VOXEL * experiment.grid.voxel_mm
+    for pair in shown.pairs:
         try:
+            light = shown.pair(pair)
             for images in light:
                 volumes.add(images)
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
@@ -174,25 +169,21 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Cam
             continue
         used.append(pair)
         found = volumes.disparities()
-        if lost := unlinked(found, weights.cameras):
-            losses += 1
-            clear = clear and all(_shows_particles(images, weights.cameras) for images in light)
+        if unlinked(found, weights.cameras):
+            fit = None
+            if all(_shows_particles(images, weights.cameras) for images in light):
+                nothing.append(pair)
             continue
         fit = fit_movements(found, list(weights.cameras), experiment.grid)
         if fit.separation.differs_from(limit_mm) and (fit.separation.mm < limit_mm or _agree(volumes, used, fit)):
             break
-    if fit is None or lost:
-        if clear and losses >= LEAST_FOR_NOTHING:
-            warning = _nothing_in_common(dict.fromkeys(used, lost), len(weights.cameras))
-            warn(log, warning if experiment.series is None else warning.by_instant())
-        return None
+    if fit is None:
+        return nothing if nothing == used else []
     separation = fit.separation
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
-    text = "cameras show the particles of %s %.2f voxel apart (standard error %.2f)"
-    log.info(text, name_pairs(used, experiment.noun), disparity, std)
     if disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
         warn(log, _apart(disparity, experiment, weights.cameras))
-    return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pair=used[0])
+    return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pairs=tuple(used))
 
 
 def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> bool:
@@ -205,34 +196,59 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
 
 
 @dataclass(frozen=True)
-class _ShownParticles:
-    """Particle images of the pairs that show particles. An image of each camera is given by its name."""
+class ShownParticles:
+    """Images of the pairs that show particles, without the light that stays in place in all of them.
+
+    One pair does not tell that light in a slow flow, where particles hardly move between its frames.
+    """
 
     experiment: Experiment
     cameras: Mapping[str, CalibratedCamera]
+    pairs: Sequence[int]
 
     @cached_property
     def _darks(self) -> Mapping[str, np.ndarray | None]:
         return read_darks(self.experiment)
 
-    def without_still_light(self, pairs: Sequence[int]) -> Iterator[tuple[int, list[dict[str, np.ndarray]]]]:
-        """Yield each pair and the images of both its frames, without the light that stays in place in all pairs.
+    @cached_property
+    def _recent(self) -> dict[Frame, Mapping[str, np.ndarray]]:
+        """The images that were read last: those of all pairs may not fit into memory."""
+        return {}
 
-        One pair does not tell that light in a slow flow, where particles hardly move between its frames. Images are
-        read twice, since those of all pairs may not fit into memory.
-        """
-        still = still_light(images for _, frames in self._each(pairs) for images in frames)
-        for pair, frames in self._each(pairs):
-            yield pair, [without_still_light(images, still) for images in frames]
+    @cached_property
+    def _still(self) -> dict[str, np.ndarray]:
+        return still_light(images for pair in self.pairs for images in self._readable(pair))
 
-    def _each(self, pairs: Iterable[int]) -> Iterator[tuple[int, list[Mapping[str, np.ndarray]]]]:
-        for pair in pairs:
-            try:
-                light = [self._light(frame) for frame in self.experiment.pair_frames(pair)]
-            except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
-                log.debug("movements of the cameras without pair %d: %s", pair, error)
-                continue
-            yield pair, light
+    def __call__(self, pair: int, frame: int) -> Mapping[str, np.ndarray] | None:
+        """Return the images of a frame, 0 or 1, of a pair, camera -> image; None if it has none that show particles."""
+        if pair not in self.experiment.numbers:
+            return None
+        try:
+            return self._moving(self.experiment.pair_frames(pair)[frame])
+        except ValueError as error:
+            log.debug("images of %s are not compared: %s", self.experiment.name_of(pair), error)
+            return None
+
+    def pair(self, pair: int) -> list[Mapping[str, np.ndarray]]:
+        """Return the images of both frames; raise ValueError if one is missing or damaged, or shows only noise."""
+        return [self._moving(frame) for frame in self.experiment.pair_frames(pair)]
+
+    def _moving(self, frame: Frame) -> Mapping[str, np.ndarray]:
+        if frame not in self._recent:
+            still = self._still
+            found = without_still_light(self._light(frame), still) if still else self._light(frame)
+            for old in list(self._recent)[: 1 - len(self.experiment.frames)]:
+                del self._recent[old]
+            self._recent[frame] = found
+        return self._recent[frame]
+
+    def _readable(self, pair: int) -> list[Mapping[str, np.ndarray]]:
+        """Return the images of both frames with the light that stays in place; none if those of one cannot be used."""
+        try:
+            return [self._light(frame) for frame in self.experiment.pair_frames(pair)]
+        except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("movements of the cameras without pair %d: %s", pair, error)
+            return []
 
     def _light(self, frame: Frame) -> Mapping[str, np.ndarray]:
         """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
@@ -256,11 +272,3 @@ def _apart(disparity: float, experiment: Experiment, cameras: Mapping[str, Calib
     )
     distance_mm = disparity * experiment.grid.voxel_mm
     return Warning(code=Code.APART, figures={"names": names, "voxel": disparity, "mm": distance_mm, "advice": advice})
-
-
-def _nothing_in_common(lost: Mapping[int, Sequence[str]], cameras: int) -> Warning:
-    """Return the warning about the cameras, by pair, that share no particle with another camera."""
-    names = dict.fromkeys(name for some in lost.values() for name in some)
-    others = "" if len(names) == cameras else " and the other cameras"
-    figures = {"names": f"{' and '.join(names)}{others}", "search": SEARCH_VOXEL}
-    return Warning(code=Code.NOTHING_IN_COMMON, pairs=tuple(lost), figures=figures)

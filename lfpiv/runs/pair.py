@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.sequence import Before
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
-from lfpiv.runs import pair_figures
+from lfpiv.runs import belonging, pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
@@ -70,6 +70,8 @@ class PairWork:
     """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
+    refusals: tuple[Warning, ...] = ()
+    """Why the vectors of all pairs, or of some, are not valid; see `belonging.check`."""
     scratch: Path | None = None
     """Folder in which processes store volumes for each other; None for a process by itself."""
     log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
@@ -196,6 +198,8 @@ class PairWork:
     def volumes(self, files: PairFiles, instants: Instants | None, progress: StepProgress) -> PairVolumes:
         """Read the volumes of a pair, or reconstruct both together, those of a series each by itself.
 
+        Refusals of the pair go with them.
+
         Raises
         ------
         Failure
@@ -205,15 +209,17 @@ class PairWork:
         StorageError
             If a volume cannot be written.
         """
+        refusals = belonging.of_pair(self.experiment, self.refusals, files.pair)
         if instants is not None:
-            return instants.volumes(files, progress)
+            both = instants.volumes(files, progress)
+            return replace(both, between=(*both.between, *refusals))
         frames = files.read_volumes()
         if frames is None:
             frames = self._reconstruct_pair(files, progress)
             if self.keep_volumes:
                 for file, found in zip(files.frames, frames, strict=True):
                     self.write(partial(file.write, found), large=True)
-        return PairVolumes(frames=frames, names=self.experiment.frames)
+        return PairVolumes(frames=frames, names=self.experiment.frames, between=refusals)
 
     def _reconstruct_pair(self, files: PairFiles, progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
         if self.weights is None:

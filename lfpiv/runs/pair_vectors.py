@@ -14,11 +14,14 @@ from lfpiv.lightfield import image_checks
 from lfpiv.reconstruction.motion import Motion, unshared_quality
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.warn import Code
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
 MISPLACED = "an image does not belong to its camera's white image: none of the vectors counts"
 """Verdict on the vectors of a pair if the light of an image lies beside the microimages."""
+UNLIKE_PARTICLES = "the images of the cameras do not belong together: none of the vectors counts"
+"""Verdict on the vectors of a pair whose images of one instant show different particles."""
 
 
 def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Experiment) -> xr.Dataset:
@@ -28,10 +31,12 @@ def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Exper
 
 
 def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
-    """Mark all vectors as not valid if an image is misplaced, or too few cameras saw particles in a frame."""
+    """Mark all vectors as not valid if images do not belong where they are, or too few cameras saw particles."""
     cameras = len(volumes.records[0].structure)
     warnings = [record.warnings for record in volumes.records]
-    if image_checks.misplaced(warnings):
+    if any(warning.code in (Code.MISMATCHED, Code.NOTHING_IN_COMMON) for warning in volumes.between):
+        verdict = UNLIKE_PARTICLES
+    elif image_checks.misplaced(warnings):
         verdict = MISPLACED
     elif image_checks.unmeasured(warnings, cameras):
         verdict = NO_PARTICLES

@@ -159,7 +159,7 @@ def reconstruct(
         done = Invocation(tried=checked.failed or Tried(current.numbers))
         if checked.failed is None and (first := checked.todo.ahead()):
             weights, figures = rig.build_weights(current, prepared, first)
-            work = rig.pair_work(current, weights, keep_volumes=True, vectors=False)
+            work = rig.pair_work(current, weights, keep_volumes=True, vectors=False, figures=figures)
             done = Invocation(tried=_sequential(current, work, checked.todo), weights=figures)
         return current.finish(calibrated, _with_reused(current, done, checked.todo, "volumes"), report=False)
 
@@ -262,7 +262,7 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
         if isinstance(workers, Plan):
             finest = current.reconstructed_experiment
             workers = worker_plan.fit_memory(workers, finest, weights.memory_bytes, current.device)
-    work = rig.pair_work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration)
+    work = rig.pair_work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration, figures=figures)
     if isinstance(workers, Plan) and workers.workers == 1:
         return Invocation(tried=_sequential(current, work, todo), weights=figures), _known(weights)
     if isinstance(workers, Plan):

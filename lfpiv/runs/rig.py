@@ -22,7 +22,7 @@ from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
 from lfpiv.results import datasets, provenance, stamps
-from lfpiv.runs import background, guard, memory, moved_cameras, refinement
+from lfpiv.runs import background, belonging, guard, memory, moved_cameras, refinement
 from lfpiv.runs.frame_light import read_darks, sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
@@ -238,7 +238,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
         _ = weights.camera_sums  # computed here, once for all pairs and workers
         seconds = time.perf_counter() - start
         counted = compare_with_count(weights)
-        disparity = moved_cameras.check(experiment, weights, todo)
+        agreement = belonging.check(experiment, weights, todo)
     errors = [error for camera in counted.values() for error in camera]
     if errors:  # a camera may see none of the voxels that were drawn
         share = 100 * np.mean(errors)
@@ -248,7 +248,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
         memory_mib=weights.memory_bytes / MIB,
         seconds=seconds,
         warnings=tuple(warnings),
-        disparity=disparity,
+        agreement=agreement,
         forms=weights.forms,
         cuts=weights.cuts,
         profile_errors=weights.profile_errors,
@@ -264,8 +264,12 @@ def pair_work(
     keep_volumes: bool,
     vectors: bool = True,
     calibration: Calibration | None = None,
+    figures: WeightsFigures | None = None,
 ) -> PairWork:
-    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights."""
+    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights.
+
+    Without `figures` of the weights, the refusals are those of an earlier invocation.
+    """
     cameras = {} if calibration is None or run.experiment.series is None else calibration.cameras
     if weights is not None:
         cameras = weights.cameras
@@ -281,6 +285,7 @@ def pair_work(
         keep_volumes=keep_volumes,
         background=run.background,
         vectors=vectors,
+        refusals=run.earlier.refusals if figures is None else figures.agreement.refusals,
     )
 
 

@@ -83,6 +83,8 @@ class EarlierSummary:
     weights: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the weights as stored; empty if there were none."""
     weights_s: float = 0.0
+    refusals: tuple[Warning, ...] = ()
+    """Why vectors are not valid, see `belonging.check`."""
     failed: Mapping[int, str] = field(default_factory=dict)
     """Pair -> why it failed."""
     peak_memory_mib: float | None = None
@@ -134,6 +136,7 @@ def read(path: Path) -> EarlierSummary:
         known = validate(_Stored, found)
         validate(_Weights, known.weights)
         from_list(known.weights.get("warnings", []))
+        refusals = from_list(known.weights.get("refusals", []))
     except FileNotFoundError:
         return EarlierSummary()
     except RecordError as error:
@@ -142,6 +145,7 @@ def read(path: Path) -> EarlierSummary:
     return EarlierSummary(
         weights=known.weights,
         weights_s=known.timings_s.get("weights") or 0.0,
+        refusals=refusals,
         failed={failure.pair: failure.reason for failure in known.failed},
         peak_memory_mib=known.peak_memory_mib,
     )
@@ -307,6 +311,7 @@ def _warnings(
         *guard.warnings(experiment, contents.guard),
         *refinement.warnings(experiment, contents.refinement),
         *map(Warning.from_json, weights.get("warnings", ())),
+        *map(Warning.from_json, () if contents.vectors else weights.get("refusals", ())),
         *contents.background_warnings,
         *of_pairs,
         *copied_warnings(contents.copies, experiment.noun),

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import PydanticSerializationError
 
+from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import size_text, writing
@@ -52,6 +53,8 @@ class Task(BaseModel):
     refinement: float
     keep_volumes: bool
     background: str | None
+    refusals: str
+    """JSON text of `PairWork.refusals`."""
     vectors: bool
     weights: str | None
     """Digest of the weights; None if no volume has to be reconstructed."""
@@ -72,6 +75,7 @@ class Task(BaseModel):
             darks={},
             keep_volumes=self.keep_volumes,
             background=self.background,
+            refusals=warn.from_text(self.refusals),
             vectors=self.vectors,
             scratch=None if self.experiment.series is None else shared / INSTANTS,
         )
@@ -105,6 +109,7 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
         refinement=work.refinement,
         keep_volumes=work.keep_volumes,
         background=work.background,
+        refusals=warn.to_text(work.refusals),
         vectors=work.vectors,
         weights=None if work.weights is None else save_weights(work.weights, base / WEIGHTS),
         device=device,

@@ -52,6 +52,7 @@ class Code(enum.Enum):
     COARSE_VOXELS = "coarse_voxels"
     APART = "apart"
     NOTHING_IN_COMMON = "nothing_in_common"
+    MISMATCHED = "mismatched"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
     # weights
     WEIGHTS_UNCHECKED = "weights_unchecked"
@@ -217,9 +218,10 @@ SENTENCES: Mapping[Code, str] = {
         "recorded; {advice}."
     ),
     Code.NOTHING_IN_COMMON: (
-        "{names} show no particles in common within {search} voxels: a camera moved by more, their images are of "
-        "different instants, or show very few particles."
+        "{names} show no particles in common within {search} voxels, so no vector is valid: a camera moved by more, "
+        "their images are of different instants, or show very few particles."
     ),
+    Code.MISMATCHED: "{found}, as the particles show, so no vector is valid. {remedy}, and run again.",
     Code.NOT_SELF_CALIBRATED: (
         "self-calibration keeps the calibration of the board: {verdict}. Check the particle images, use more pairs "
         "(self_calibration.pairs), or record the board again if a camera moved."

@@ -1,0 +1,203 @@
+"""Check that the images of all cameras belong together, by the first pairs of a run, and refuse what does not.
+
+Images that a mistake brought together give volumes, and vectors that agree with their neighbours. `check` looks for the
+mistake before any pair is reconstructed. Its refusals go with the pairs, whose vectors are then not valid.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import chain, islice
+from typing import TYPE_CHECKING
+
+from lfpiv.runs import moved_cameras
+from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
+from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration.disparity import SEARCH_VOXEL
+from lfpiv.warn import Code, Warning, name_pairs
+
+if TYPE_CHECKING:
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.weights.operator import Weights
+
+log = logging.getLogger(__name__)
+
+TRIED = 3
+"""Largest number of pairs that are judged. One is enough if its images fit each other clearly."""
+LEAST_FOR_NOTHING = 2
+"""Least number of pairs without common particles that a refusal of them needs."""
+NEIGHBOURS = (1, -1, 2, -2)
+"""Pairs, or instants, by which a camera may be late."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """What a run knows of its cameras: whether their images belong together, and how far apart they show particles."""
+
+    sentence: str
+    """What was found, or why nothing was, for people."""
+    disparity: CameraDisparity | None = None
+    refusals: tuple[Warning, ...] = ()
+    """Why vectors are not valid, each with its pairs; without pairs it concerns all of them."""
+
+
+def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agreement:
+    """Judge the images of some pairs, `pairs` first, and measure how far apart the cameras show the same particles.
+
+    The log says what was found; warnings are raised where a camera moved. Refusals go with the result.
+    """
+    names = list(weights.cameras)
+    if len(names) < 2:
+        return _told("one camera: its images cannot be compared with those of another")
+    first, others = list(pairs), experiment.spread_pairs(TRIED)
+    order = chain(first[:1], others[1:], first, experiment.numbers)
+    tried = list(islice(experiment.disjoint(dict.fromkeys(order)), TRIED))
+    shown = ShownParticles(experiment, weights.cameras, tried)
+    judged = _judge(shown, weights)
+    refusals = _refusals(experiment, names, judged)
+    if refusals:
+        return _told(
+            "; ".join(dict.fromkeys(str(one.figures["found"]) for one in refusals)),
+            refusals=tuple(refusals),
+            level=logging.WARNING,
+        )
+    found = moved_cameras.check(shown, weights)
+    cameras, used = " and ".join(names), name_pairs(list(judged), experiment.noun)
+    if isinstance(found, CameraDisparity):
+        return _told(_agreement(cameras, experiment, found, judged), disparity=found)
+    if len(found) >= LEAST_FOR_NOTHING and not any(one.fits for one in judged.values()):
+        text = f"{cameras} show no particles in common"
+        figures = {"names": cameras, "search": SEARCH_VOXEL, "found": text}
+        nothing = Warning(code=Code.NOTHING_IN_COMMON, figures=figures)
+        return _told(text, refusals=(nothing,), level=logging.WARNING)
+    why = f" from {used}: too few particles, too many, or too much noise" if used else ": no images show particles"
+    return _told(f"whether {cameras} show the same particles cannot be told{why}")
+
+
+def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:
+    agreement = Agreement(sentence=sentence, **found)  # type: ignore[arg-type]
+    log.log(level, "cameras: %s", sentence)
+    return agreement
+
+
+def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity, judged: Mapping[int, Judgement]) -> str:
+    """Return how well cameras agree, for people."""
+    used = name_pairs(found.pairs, experiment.noun)
+    if found.voxel > found.std_voxel:
+        text = f"{cameras} show the particles of {used} {found.voxel:.2f} voxel apart, with a standard error of "
+        text += f"{found.std_voxel:.2f}"
+    else:
+        text = f"{cameras} show the particles of {used} at the same places, within {found.std_voxel:.2f} voxel"
+    if not any(one.in_order for one in judged.values()):
+        what = (
+            "move too little to tell the order of frames"
+            if any(one.fits for one in judged.values())
+            else ("do not tell whether images are exchanged or mirrored")
+        )
+        text += f"; they {what}"
+    return text
+
+
+def _judge(shown: ShownParticles, weights: Weights) -> dict[int, Judgement]:
+    """Judge pairs until the images of one fit each other."""
+    fit, judged = ImageFit(weights), dict[int, Judgement]()
+    for pair in shown.pairs:
+        try:
+            shown.pair(pair)
+            judged[pair] = judge(fit, shown, pair, *_shifts(shown.experiment, pair))
+        except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
+            log.debug("images of %s are not compared: %s", shown.experiment.name_of(pair), error)
+            continue
+        if judged[pair].fits:
+            break
+    return judged
+
+
+def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[int]]:
+    """Return the distances of pairs with other particles, and of those that may be mistaken for a pair.
+
+    Instants of a series show the particles of their neighbours; half a series away there are others.
+    """
+    near = [late for late in NEIGHBOURS if pair + late in experiment.numbers]
+    if experiment.series is None:
+        return near[:2], near[2:]
+    half = experiment.pairs // 2
+    return [late for late in (half, -half) if half > 2 and pair + late in experiment.numbers], near
+
+
+def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
+    """Return the refusals of pairs by mistakes that were clearly made.
+
+    A mistake made in all pairs that were judged was made in all pairs of the run.
+    """
+    if not judged:
+        return []
+    if not any(one.fits for one in judged.values()):
+        made = reduce(Judgement.joined, judged.values()).mistakes
+        if made and all(not one.mistakes or made[0] in one.mistakes for one in judged.values()):
+            return [_refusal(experiment, names, made)]
+    each = {pair: one.mistakes for pair, one in judged.items() if one.mistakes}
+    return [_numbered(experiment, _refusal(experiment, names, made), pair) for pair, made in each.items()]
+
+
+def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:
+    found = warning.of_pair(pair)
+    return found if experiment.series is None else found.by_instant()
+
+
+def _refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> Warning:
+    """Return the warning about the mistakes of which one was made."""
+    best = made[0]
+    alike = [one for one in made if one.kind is best.kind and one.late == best.late]
+    cameras = list(dict.fromkeys(name for one in alike for name in one.cameras))
+    if best.kind in (Kind.FRAMES, Kind.LATE) and len(names) == 2:
+        cameras = list(names)
+    text, remedy = _words(experiment, best, cameras)
+    return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy})
+
+
+def _words(experiment: Experiment, mistake: Mistake, cameras: Sequence[str]) -> tuple[str, str]:
+    """Return what is wrong with the images of a camera, or of one of several, and what to do."""
+    either = " or ".join(cameras)
+    if mistake.kind is Kind.CAMERAS:
+        return (
+            f"the particle images of {' and '.join(cameras)} are exchanged",
+            "Exchange them, or the names of the cameras",
+        )
+    if mistake.kind is Kind.FRAMES:
+        first, second = experiment.frames if experiment.series is None else ("k", f"k + {experiment.series.step}")
+        what = "frames" if experiment.series is None else "instants"
+        return f"the {what} {first} and {second} of {either} are exchanged", "Put the images of that camera into order"
+    if mistake.kind in FLIPS:
+        how = {
+            Kind.HORIZONTAL: "left to right",
+            Kind.VERTICAL: "upside down",
+            Kind.BOTH: "left to right and upside down",
+        }[mistake.kind]
+        flips = {name: _flipped(experiment.camera(name).image_flip, mistake.kind) for name in cameras}
+        keys = " or ".join(f'image_flip = "{flip}" of {name}' for name, flip in flips.items())
+        return f"the particle images of {either} are mirrored {how}", (
+            f"Set {keys} if white and board images are mirrored, too; otherwise store the particle images as those are"
+        )
+    noun = experiment.noun
+    count = f"{abs(mistake.late)} {noun}{'s' if abs(mistake.late) > 1 else ''}"
+    when, other = ("late", "early") if mistake.late > 0 else ("early", "late")
+    text = f"the images of {cameras[0]} are {count} {when}"
+    text += f", or those of {cameras[1]} {other}" if len(cameras) == 2 else ""
+    return text, f"Give images of the same instant the same number of {noun}"
+
+
+def _flipped(known: str, kind: Kind) -> str:
+    """Return the `image_flip` that mirrors images in addition to a known one."""
+    along = {"none": (0, 0), "horizontal": (1, 0), "vertical": (0, 1), "both": (1, 1)}
+    sides = tuple(one ^ other for one, other in zip(along[known], along[kind.value], strict=True))
+    return next(name for name, flip in along.items() if flip == sides)
+
+
+def of_pair(experiment: Experiment, refusals: Iterable[Warning], pair: int) -> tuple[Warning, ...]:
+    """Return the refusals that concern a pair, as warnings about it."""
+    found = (one for one in refusals if not (numbers := one.pairs or one.instants) or pair in numbers)
+    return tuple(_numbered(experiment, replace(one, instants=()), pair) for one in found)

@@ -1,0 +1,302 @@
+"""Belonging: whether the images of a frame show the same particles, and which mistake explains that they do not.
+
+A volume that explains the images of all cameras exists only if they show the same particles. So the light that a few
+iterations of SMART leave unexplained is compared with what they leave by chance: with the image that one camera took of
+other particles, or, without such an image, with its image turned by half a turn. The images without likely mistakes,
+such as exchanged frames or mirrored images, are tried alike. Differences are measured in parts of the sensors, which
+gives their standard error. Particles that hardly move between frames fit in either order.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from lfpiv.reconstruction.settings import PLAIN, SmartSettings
+from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.weights.operator import Weights
+
+ITERATIONS = 3
+"""SMART iterations of a set of images."""
+PART_LENSES = 3.0
+"""Edge of the parts of a sensor [microlens pitch]: the light of a particle hardly reaches farther."""
+TURN_LENSES = 3
+"""Distance from the sensor's centre of the points about which images may be turned [microlens pitch]."""
+CLEAR = 4.0
+"""Least advantage of a set of images that fits better [standard errors]; by chance 1 of 30,000 sets reaches it."""
+BEYOND_CHANCE = 3.0
+"""Least advantage of images that fit over those of other particles [standard errors]."""
+SURE = 2.0
+"""Disadvantage of all mistakes tried from which the images count as right without further trials [standard errors]."""
+
+Images = Mapping[str, np.ndarray]
+"""Camera -> image of one frame, shape (rows, columns), background removed [counts]."""
+Shown = Callable[[int, int], Images | None]
+"""Returns the images of a frame, given by the number of its pair and 0 or 1; None where there are none."""
+
+
+class Kind(enum.Enum):
+    """Kind of a mistake."""
+
+    NONE = "none"
+    FRAMES = "frames"
+    """The frames of a pair are exchanged in one camera."""
+    CAMERAS = "cameras"
+    """The images of two cameras are exchanged."""
+    HORIZONTAL = "horizontal"
+    """The images of one camera are mirrored left to right."""
+    VERTICAL = "vertical"
+    BOTH = "both"
+    LATE = "late"
+    """The images of one camera are of another pair."""
+    CHANCE = "chance"
+    """The images of one camera are turned by half a turn: no mistake, but a measure of chance."""
+
+
+IN_TIME = (Kind.FRAMES, Kind.LATE)
+"""Mistakes that replace images by others of the same camera."""
+FLIPS: Mapping[Kind, tuple[slice, slice]] = {
+    Kind.HORIZONTAL: (slice(None), slice(None, None, -1)),
+    Kind.VERTICAL: (slice(None, None, -1), slice(None)),
+    Kind.BOTH: (slice(None, None, -1), slice(None, None, -1)),
+}
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """Mistake that may have been made with the images of a pair; the empty one if they are right."""
+
+    kind: Kind = Kind.NONE
+    cameras: tuple[str, ...] = ()
+    """The camera whose images are wrong, or the two whose images are exchanged."""
+    late: int = 0
+    """Pairs by which the images of the camera are late; negative: early."""
+
+    @property
+    def named(self) -> bool:
+        """Whether it is a mistake that may have been made."""
+        return self.kind not in (Kind.NONE, Kind.CHANCE)
+
+    def undone(self, shown: Shown, pair: int, frame: int) -> Images | None:
+        """Return the images of a frame without the mistake; None where there are none."""
+        images = shown(pair, frame)
+        if images is None or not self.named:
+            return images
+        if self.kind is Kind.CAMERAS:
+            first, second = self.cameras
+            fits = images[first].shape == images[second].shape
+            return {**images, first: images[second], second: images[first]} if fits else None
+        (name,) = self.cameras
+        if self.kind in FLIPS:
+            return {**images, name: np.ascontiguousarray(images[name][FLIPS[self.kind]])}
+        at = (pair, 1 - frame) if self.kind is Kind.FRAMES else (pair + self.late, frame)
+        other = shown(*at)
+        return None if other is None else {**images, name: other[name]}
+
+
+RIGHT = Mistake()
+
+
+def likely_mistakes(cameras: Sequence[str]) -> list[Mistake]:
+    """Return the mistakes that are tried with every run."""
+    found = [Mistake(Kind.FRAMES, (name,)) for name in _one_of_two(cameras)]
+    found += [Mistake(Kind.CAMERAS, pair) for pair in combinations(cameras, 2)]
+    return found + [Mistake(Kind.HORIZONTAL, (name,)) for name in cameras]
+
+
+def other_mistakes(cameras: Sequence[str], shifts: Iterable[int]) -> list[Mistake]:
+    """Return the mistakes that are tried where images do not fit clearly, among them `shifts` of a camera in time."""
+    found = [Mistake(kind, (name,)) for kind in (Kind.VERTICAL, Kind.BOTH) for name in cameras]
+    return found + [Mistake(Kind.LATE, (name,), late) for late in shifts for name in _one_of_two(cameras)]
+
+
+def _one_of_two(cameras: Sequence[str]) -> Sequence[str]:
+    """Leave out the second of two cameras: mistakes in the order of its images are those of the first one."""
+    return cameras[:1] if len(cameras) == 2 else cameras
+
+
+class ImageFit:
+    """Light of images that no volume explains, in parts of the sensors.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator of two or more cameras.
+    """
+
+    def __init__(self, weights: Weights):
+        self.weights = weights
+        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **PLAIN))
+        self._parts = {name: self._parts_of(name) for name in weights.cameras}
+
+    def unexplained(self, images: Images, turn: str | None = None) -> np.ndarray:
+        """Return the unexplained light of each part of each sensor, over all light of the camera, shape (part,).
+
+        `turn` names a camera whose image is turned by half a turn. The light is the squared difference of the roots of
+        image and projection, which photon noise makes equally uncertain everywhere.
+        """
+        if turn is not None:
+            images = {**images, turn: self._turned(turn, images[turn])}
+        prepared = self._solver.prepare(images)
+        projected = self.weights(prepared.solve().volume)
+        found = []
+        for name, recording in prepared.recordings.items():
+            pixels, part, count = self._parts[name]
+            floor, image = np.float32(recording.floor), recording.image[pixels]
+            expected = np.float32(recording.camera_gain) * projected[name].ravel()[pixels]
+            left = (np.sqrt(image + floor) - np.sqrt(expected + floor)) ** 2
+            found.append(np.bincount(part, left, count) / max(float(image.sum(dtype=float)), 1e-30))
+        return np.concatenate(found)
+
+    def _turned(self, name: str, image: np.ndarray) -> np.ndarray:
+        """Turn an image by half a turn about a point where the microlens array is symmetric."""
+        optics, lattice = self.weights.cameras[name].optics, self.weights.cameras[name].lattice
+        around = np.stack(np.meshgrid(*[np.arange(-TURN_LENSES, TURN_LENSES + 1)] * 2), -1).reshape(-1, 2)
+        sums = np.asarray(lattice.origin_mm) + lattice.centres_mm(around)
+        shift = sums * (1 + optics.sensor_per_pupil) / optics.pixel_mm
+        column, row = shift[np.abs(shift - np.rint(shift)).sum(1).argmin()]
+        return np.roll(image[::-1, ::-1], (round(row), round(column)), (0, 1))
+
+    def _parts_of(self, name: str) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the lit pixels of a camera, the number of the part that each is in, and the number of parts."""
+        pixels = self.weights.projector(name).map.pixel
+        pixels = np.unique(pixels[self.weights.gain(name).ravel()[pixels] > 0])
+        optics = self.weights.cameras[name].optics
+        edge = PART_LENSES * optics.microimage_pitch_px
+        row, column = (np.asarray(index / edge, int) for index in np.divmod(pixels, optics.sensor_shape[1]))
+        _, part = np.unique(row * (1 + int(column.max())) + column, return_inverse=True)
+        return pixels, part, int(part.max()) + 1
+
+
+def advantage(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
+    """Return how clearly one set of images leaves less light unexplained than another one [standard errors].
+
+    Under chance the differences of all parts have either sign. Frames that only one set has do not count.
+    """
+    difference = np.concatenate([b - a for a, b in zip(one, other, strict=False)])
+    scatter = float(np.sqrt(difference @ difference))
+    return float(difference.sum()) / scatter if scatter > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What was found about the images of some pairs."""
+
+    left: Mapping[Mistake, Sequence[np.ndarray]]
+    """Mistake -> light that is unexplained without it, of each frame that was tried."""
+    chance: Sequence[Mistake]
+    """What replaces an image by that of other particles."""
+    turned: Mapping[Mistake, Sequence[np.ndarray]] = field(default_factory=dict)
+    """Mistake -> light that is unexplained without it and with an image turned, of the likeliest mistake."""
+
+    def margin(self, mistake: Mistake) -> float:
+        """Return the advantage of the images as they are over those without a mistake [standard errors]."""
+        return advantage(self.left[RIGHT], self.left[mistake])
+
+    @property
+    def tried(self) -> list[Mistake]:
+        """The mistakes that were tried, the likeliest first."""
+        return sorted((one for one in self.left if one.named), key=self.margin)
+
+    @property
+    def mistakes(self) -> tuple[Mistake, ...]:
+        """The mistake that was clearly made, with others that explain the images as well; empty for none."""
+        clear = [one for one in self.tried if self.margin(one) < -CLEAR]
+        if not clear or clear[0] not in self.turned:
+            return ()
+        best = self.left[clear[0]]
+        if advantage(best, self.turned[clear[0]]) < BEYOND_CHANCE:
+            return ()
+        return tuple(one for one in clear if advantage(best, self.left[one]) < SURE)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the images fit clearly better than by chance, and than those of other cameras and mirrored ones.
+
+        The order of frames does not count, since particles that hardly move fit in either order.
+        """
+        wrong = [one for one in self.tried if one.kind not in IN_TIME]
+        return not self.mistakes and self.over_chance > BEYOND_CHANCE and all(self.margin(one) > SURE for one in wrong)
+
+    @property
+    def in_order(self) -> bool:
+        """Whether the images also fit clearly better than those of other frames."""
+        return self.fits and all(self.margin(one) > SURE for one in self.tried)
+
+    @property
+    def over_chance(self) -> float:
+        """Return the least advantage of the images as they are over those of other particles [standard errors]."""
+        return min(self.margin(one) for one in self.chance if one in self.left)
+
+    def joined(self, other: Judgement) -> Judgement:
+        """Return the judgement by the frames of both, about the mistakes that were tried in both."""
+
+        def both(
+            mine: Mapping[Mistake, Sequence[np.ndarray]], others: Mapping[Mistake, Sequence[np.ndarray]]
+        ) -> dict[Mistake, list[np.ndarray]]:
+            return {one: [*mine[one], *others[one]] for one in mine if one in others}
+
+        left = both(self.left, other.left)
+        chance = [one for one in self.chance if one in left]
+        return Judgement(left, chance, both(self.turned, other.turned))
+
+
+def judge(fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: Sequence[int]) -> Judgement:
+    """Judge the images of a pair.
+
+    The first frame and the likely mistakes are tried first. Where only the order of frames is in doubt, it is tried in
+    the second frame, too. Other doubts are followed by all mistakes and both frames.
+
+    Parameters
+    ----------
+    fit : ImageFit
+    shown : callable
+        Returns images.
+    pair : int
+        Number of the pair.
+    others, near : sequence of int
+        Distances of pairs that show other particles, the one to compare with first, and of others that may be mistaken
+        for the pair.
+
+    Raises
+    ------
+    ValueError
+        If the images of the pair cannot be reconstructed.
+    """
+    cameras = list(fit.weights.cameras)
+    left: dict[Mistake, list[np.ndarray]] = {}
+
+    def try_frames(mistakes: Iterable[Mistake], count: int) -> Judgement:
+        for frame in range(count):
+            for one in mistakes:
+                tried = left.setdefault(one, [])
+                if len(tried) == frame and (images := one.undone(shown, pair, frame)) is not None:
+                    tried.append(fit.unexplained(images, one.cameras[0] if one.kind is Kind.CHANCE else None))
+        known = {one: tried for one, tried in left.items() if tried}
+        return Judgement(known, [one for one in chance if one in known])
+
+    shifts = [late for late in others if shown(pair + late, 0) is not None]
+    chance = [Mistake(Kind.LATE, (name,), late) for late in shifts for name in _one_of_two(cameras)]
+    if not chance:
+        chance = [Mistake(Kind.CHANCE, (name,)) for name in _one_of_two(cameras)]
+    likely = [RIGHT, *chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
+    found = try_frames(likely, 1)
+    if found.in_order:
+        return found
+    ordering = [one for one in likely if one is RIGHT or one.kind is Kind.FRAMES]
+    if found.fits:
+        found = try_frames(ordering, 2)
+        each = [advantage(left[RIGHT][at : at + 1], left[one][at : at + 1]) for one in ordering[1:] for at in (0, 1)]
+        if found.fits and min(each) > -SURE:
+            return found
+    found = try_frames([*likely, *chance, *other_mistakes(cameras, near)], 2)
+    best = found.tried[0]
+    if found.margin(best) > -SURE:
+        return found
+    undone = [images for frame in (0, 1) if (images := best.undone(shown, pair, frame)) is not None]
+    turned = {best: [fit.unexplained(images, best.cameras[0]) for images in undone]}
+    return Judgement(found.left, found.chance, turned)
