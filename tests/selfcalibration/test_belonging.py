@@ -1,0 +1,105 @@
+"""Images of cameras that do not belong together: found, named, and refused with their pairs."""
+
+import functools
+
+import numpy as np
+import pytest
+
+import lfpiv
+from lfpiv.runs import belonging, pipeline
+from lfpiv.runs.frame_light import frame_light, read_darks
+from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Kind, Mistake, judge
+from lfpiv.warn import Code
+
+OTHERS, NEAR = (1, 2), (3,)
+"""Distances of pairs with other particles, and of more that may be mistaken for the first of four pairs."""
+
+
+@pytest.fixture(scope="module")
+def rig(small_run):
+    experiment = lfpiv.open_experiment(small_run.experiment)
+    return experiment, lfpiv.build_weights(lfpiv.load_calibration(small_run.out / "calibration.h5"), experiment.grid)
+
+
+@pytest.fixture(scope="module")
+def shown(rig):
+    experiment, weights = rig
+    darks = read_darks(experiment)
+
+    @functools.cache
+    def images(pair, frame):
+        if pair not in experiment.numbers:
+            return None
+        return frame_light(experiment, weights.cameras, darks, experiment.pair_frames(pair)[frame]).images
+
+    return images
+
+
+def judged(rig, shown):
+    return judge(ImageFit(rig[1]), shown, 0, OTHERS, NEAR)
+
+
+def test_images_that_belong_together_are_told_by_few_trials(rig, shown):
+    found = judged(rig, shown)
+    assert found.fits and not found.mistakes and found.over_chance > 3
+    assert max(len(frames) for frames in found.left.values()) <= 2 and Mistake(Kind.BOTH, ("left",)) not in found.left
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (lambda shown, pair, frame: shown(pair, 1 - frame)["left"], Mistake(Kind.FRAMES, ("left",))),
+        (
+            lambda shown, pair, frame: shown(pair, frame)["left"][FLIPS[Kind.HORIZONTAL]],
+            Mistake(Kind.HORIZONTAL, ("left",)),
+        ),
+        (lambda shown, pair, frame: shown((pair - 1) % 4, frame)["left"], Mistake(Kind.LATE, ("left",), 1)),
+    ],
+    ids=["frames", "mirrored", "late"],
+)
+def test_what_was_done_to_one_camera_is_named(rig, shown, wrong, named):
+    def mistaken(pair, frame):
+        images = shown(pair, frame)
+        return None if images is None else {**images, "left": np.ascontiguousarray(wrong(shown, pair, frame))}
+
+    found = judged(rig, mistaken)
+    assert found.mistakes[0] == named and not found.fits
+
+
+def test_images_of_two_cameras_that_are_exchanged_are_named(rig, shown):
+    def mistaken(pair, frame):
+        images = shown(pair, frame)
+        return None if images is None else {"left": images["right"], "right": images["left"]}
+
+    assert judged(rig, mistaken).mistakes == (Mistake(Kind.CAMERAS, ("left", "right")),)
+
+
+def test_images_of_other_particles_do_not_fit(rig, shown):
+    def foreign(pair, frame):
+        images = shown(pair, frame)
+        return None if images is None else {**images, "left": np.flipud(np.roll(images["left"], 25, axis=1))}
+
+    assert not judged(rig, foreign).fits
+
+
+def test_one_camera_cannot_be_checked_and_that_is_said(rig):
+    experiment, weights = rig
+    found = belonging.check(experiment, weights.of_camera("left"), [0])
+    assert "one camera" in found.sentence and not found.refusals
+
+
+def test_a_pair_whose_frames_are_exchanged_in_one_camera_is_refused(small_run, tmp_path, empty_report):
+    file = small_run.images(tmp_path / "data")
+    left = sorted((file.parent / "particles" / "left").iterdir())
+    for first, second in zip(left[::2], left[1::2], strict=True):
+        first.rename(kept := first.with_suffix(".kept"))
+        second.rename(first)
+        kept.rename(second)
+    out = small_run.prepared(tmp_path / "out")
+    summary = pipeline.run(file, out, pairs=(0, 1))
+    said = [text for text in summary["warnings"] if "the frames a and b of left or right are exchanged" in text]
+    assert len(said) == 1 and said[0].startswith("pair 0: ")
+    assert summary["pairs"][0]["valid_fraction"] == 0 and "exchanged" in summary["weights"]["cameras"]
+    again = pipeline.run(file, out, pairs=(0, 1))
+    assert said[0] in again["warnings"] and again["pairs"][0]["valid_fraction"] == 0
+    assert any(one["code"] == Code.MISMATCHED.value for one in again["warning_records"])
