@@ -24,7 +24,7 @@ from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import finished, provenance, stamps, summary_file
+from lfpiv.results import finished, netcdf, provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -35,6 +35,7 @@ from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.refinement import Refinement
+from lfpiv.runs.reversed_pairs import reversed_pairs
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.runs.todo import Todo
 from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs, warn
@@ -346,7 +347,7 @@ class Run:
         done = replace(
             done,
             reused=reused,
-            warnings=tuple(self.warnings),
+            warnings=(*self.warnings, *self._reversed(contents)),
             workers=done.workers or Workers(count=1, threads=self.device.threads),
         )
         with writing(self.folder.pairs):
@@ -361,6 +362,13 @@ class Run:
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
         return summary_file.write(result, self.folder.summary)
+
+    def _reversed(self, contents: Contents) -> list[Warning]:
+        """Log and return the warning about pairs whose flow runs against that of the others."""
+        found = reversed_pairs(list(contents.vectors), lambda pair: netcdf.read_vectors(self.folder.vectors(pair)))
+        for warning in found:
+            log.warning("%s", warning.sentence)
+        return found
 
     def _contents(self) -> Contents:
         """Read the figures of all finished pairs of the experiment, from the attributes of their files."""

@@ -65,6 +65,7 @@ class Code(enum.Enum):
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
+    REVERSED = "reversed"
     FEW_VECTORS = "few_vectors"
     CROWDED = "crowded"
     UNLINKED = "unlinked"
@@ -258,6 +259,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.UNSEEDED: (
         "{share:percent} % of the volume holds no particles; {lost:percent} % of the vectors are not valid for this "
         "reason. Where there is no fluid, state a mask (volume.mask, volume.solid)"
+    ),
+    Code.REVERSED: (
+        "the flow runs against {others}: unless it turned, the frames of a pair are exchanged in every camera. Check "
+        "the order of its images"
     ),
     Code.FEW_VECTORS: (
         "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "
