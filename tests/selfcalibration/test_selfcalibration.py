@@ -250,7 +250,7 @@ def test_cameras_of_different_instants_are_named(small_run, tmp_path, empty_repo
         old.with_name(f"old_{old.name}").rename(new)
     summary = pipeline.run(file, small_run.calibrated(tmp_path / "out"), pairs=(0, 3))
     said = [
-        text for text in summary["warnings"] if "the images of left are 1 pair late, or those of right early" in text
+        text for text in summary["warnings"] if "the images of left are 1 pair early, or those of right late" in text
     ]
     assert len(said) == 1 and said[0].startswith("pairs 0, 1, 2: ") and summary["valid_fraction"] == 0
     assert "disparity_voxel" not in summary["weights"]
