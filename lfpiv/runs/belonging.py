@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
-from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration.belonging import FLIPS, SURE, ImageFit, Judgement, Kind, Mistake, judge
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL
 from lfpiv.warn import Code, Warning, name_pairs
 
@@ -77,6 +77,23 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     return _told(f"whether {cameras} show the same particles cannot be told{why}")
 
 
+def refusals_of(shown: ShownParticles, fit: ImageFit, pair: int) -> list[Warning]:
+    """Judge a pair that explains its images worse than others do; return why it is refused, empty if it is not."""
+    experiment, names = shown.experiment, list(shown.cameras)
+    try:
+        light = shown.pair(pair)
+        found = judge(fit, shown, pair, *_shifts(experiment, pair), thorough=True)
+    except ValueError as error:  # its images were there before
+        log.debug("images of %s are not compared: %s", experiment.name_of(pair), error)
+        return []
+    if found.mistakes:
+        return [_numbered(experiment, _refusal(experiment, names, found.mistakes), pair)]
+    if found.fits or found.over_chance > SURE or not moved_cameras.all_show_particles(light, shown.cameras):
+        return []
+    figures = {"found": f"{' and '.join(names)} show different particles", "remedy": "Check the images of this pair"}
+    return [_numbered(experiment, Warning(code=Code.MISMATCHED, figures=figures), pair)]
+
+
 def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:
     agreement = Agreement(sentence=sentence, **found)  # type: ignore[arg-type]
     log.log(level, "cameras: %s", sentence)
@@ -131,15 +148,14 @@ def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[
 def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
     """Return the refusals of pairs by mistakes that were clearly made.
 
-    A mistake made in all pairs that were judged was made in all pairs of the run.
+    If the images of no judged pair fit, a mistake on which those agree that show any was made in all pairs of the run.
     """
-    if not judged:
-        return []
-    if not any(one.fits for one in judged.values()):
-        made = reduce(Judgement.joined, judged.values()).mistakes
-        if made and all(not one.mistakes or made[0] in one.mistakes for one in judged.values()):
-            return [_refusal(experiment, names, made)]
     each = {pair: one.mistakes for pair, one in judged.items() if one.mistakes}
+    if judged and not any(one.fits for one in judged.values()):
+        shared = list(each.values()) or [reduce(Judgement.joined, judged.values()).mistakes]
+        made = [one for one in shared[0] if all(one in others for others in shared)]
+        if made:
+            return [_refusal(experiment, names, made)]
     return [_numbered(experiment, _refusal(experiment, names, made), pair) for pair, made in each.items()]
 
 

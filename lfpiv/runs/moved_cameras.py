@@ -171,7 +171,7 @@ def check(shown: ShownParticles, weights: Weights) -> CameraDisparity | Sequence
         found = volumes.disparities()
         if unlinked(found, weights.cameras):
             fit = None
-            if all(_shows_particles(images, weights.cameras) for images in light):
+            if all_show_particles(light, weights.cameras):
                 nothing.append(pair)
             continue
         fit = fit_movements(found, list(weights.cameras), experiment.grid)
@@ -258,9 +258,11 @@ class ShownParticles:
         return found.images
 
 
-def _shows_particles(images: Mapping[str, np.ndarray], cameras: Mapping[str, CalibratedCamera]) -> bool:
-    """Return whether images without still light show particles clearly, in every camera."""
-    return all(seen_structure(images[name], camera.decoder) > CLEAR for name, camera in cameras.items())
+def all_show_particles(frames: Sequence[Mapping[str, np.ndarray]], cameras: Mapping[str, CalibratedCamera]) -> bool:
+    """Return whether images without still light show particles clearly, in every frame and camera."""
+    return all(
+        seen_structure(images[name], camera.decoder) > CLEAR for images in frames for name, camera in cameras.items()
+    )
 
 
 def _apart(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> Warning:

@@ -42,6 +42,11 @@ def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
         verdict = NO_PARTICLES
     else:
         return vectors
+    return refused(vectors, verdict)
+
+
+def refused(vectors: xr.Dataset, verdict: str) -> xr.Dataset:
+    """Mark all vectors as not valid."""
     valid = xr.zeros_like(vectors["valid"])  # keeps its attributes
     names = [name for name in vectors.data_vars if str(name).startswith("uncertainty")]
     changed = {"valid": valid, **{str(name): vectors[name].where(valid) for name in names}}

@@ -113,6 +113,7 @@ def run(
             checked = _check(current, todo, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done, weights = _process(current, prepared, checked, keep_volumes)
+        done, weights = _settle(current, prepared, done, weights)
         done, weights = _follow(current, prepared, done, weights)
         done = _bootstrap(current, prepared, done, weights)
         summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
@@ -282,6 +283,14 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
 
 def _known(weights: Weights | None) -> _Weights:
     return lambda: weights
+
+
+def _settle(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
+    """Refuse pairs whose images do not belong together; return the invocation, and the weights if they were built."""
+    lazy = _Lazily(current, prepared, weights)
+    if done.weights is not None:  # otherwise no image was reconstructed
+        current.settle(lazy.work)
+    return lazy.after(done), lazy.weights
 
 
 def _follow(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:

@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,11 @@ from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
 from lfpiv.results.track_files import track_figures
-from lfpiv.runs import bootstrap, guard, memory, pair_figures, refinement, summary
+from lfpiv.runs import bootstrap, guard, memory, odd_pairs, pair_figures, refinement, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
+from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.reversed_pairs import reversed_pairs
@@ -362,6 +363,11 @@ class Run:
                 write_report(self.experiment, calibrated.calibration, result, vectors, self.folder.report)
             result |= self._usage(done, result["timings_s"] | {"report": time.perf_counter() - start})
         return summary_file.write(result, self.folder.summary)
+
+    def settle(self, make_work: Callable[[], PairWork]) -> None:
+        """Refuse finished pairs whose images do not belong together; `make_work` returns the work with its weights."""
+        for pair in odd_pairs.settle(self.finished, self.files, make_work):
+            self._keep(self.files(pair))
 
     def _reversed(self, contents: Contents) -> list[Warning]:
         """Log and return the warning about pairs whose flow runs against that of the others."""

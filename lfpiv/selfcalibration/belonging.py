@@ -27,9 +27,10 @@ PART_LENSES = 3.0
 TURN_LENSES = 3
 """Distance from the sensor's centre of the points about which images may be turned [microlens pitch]."""
 CLEAR = 4.0
-"""Least advantage of a set of images that fits better [standard errors]; by chance 1 of 30,000 sets reaches it."""
+"""Least advantage of images that fit over those of other particles, and of images without a mistake that is named over
+those with it [standard errors]."""
 BEYOND_CHANCE = 3.0
-"""Least advantage of images that fit over those of other particles [standard errors]."""
+"""Least advantage over chance of images without a mistake that is named [standard errors]."""
 SURE = 2.0
 """Disadvantage of all mistakes tried from which the images count as right without further trials [standard errors]."""
 
@@ -220,7 +221,7 @@ class Judgement:
         The order of frames does not count, since particles that hardly move fit in either order.
         """
         wrong = [one for one in self.tried if one.kind not in IN_TIME]
-        return not self.mistakes and self.over_chance > BEYOND_CHANCE and all(self.margin(one) > SURE for one in wrong)
+        return not self.mistakes and self.over_chance > CLEAR and all(self.margin(one) > SURE for one in wrong)
 
     @property
     def in_order(self) -> bool:
@@ -245,7 +246,9 @@ class Judgement:
         return Judgement(left, chance, both(self.turned, other.turned))
 
 
-def judge(fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: Sequence[int]) -> Judgement:
+def judge(
+    fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: Sequence[int], *, thorough: bool = False
+) -> Judgement:
     """Judge the images of a pair.
 
     The first frame and the likely mistakes are tried first. Where only the order of frames is in doubt, it is tried in
@@ -261,6 +264,8 @@ def judge(fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: S
     others, near : sequence of int
         Distances of pairs that show other particles, the one to compare with first, and of others that may be mistaken
         for the pair.
+    thorough : bool
+        Try all mistakes in any case.
 
     Raises
     ------
@@ -285,10 +290,10 @@ def judge(fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: S
         chance = [Mistake(Kind.CHANCE, (name,)) for name in _one_of_two(cameras)]
     likely = [RIGHT, *chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
     found = try_frames(likely, 1)
-    if found.in_order:
+    if found.in_order and not thorough:
         return found
     ordering = [one for one in likely if one is RIGHT or one.kind is Kind.FRAMES]
-    if found.fits:
+    if found.fits and not thorough:
         found = try_frames(ordering, 2)
         each = [advantage(left[RIGHT][at : at + 1], left[one][at : at + 1]) for one in ordering[1:] for at in (0, 1)]
         if found.fits and min(each) > -SURE:
