@@ -251,6 +251,11 @@ def test_the_tutorial_quotes_the_demonstration(quoted):
         {"calibration": good["calibration"] | {"left": {"dots_found": 245, "sigma_nor_test": 0.005}}},
     ):
         assert len(quoted.differences(text, scene, good | changed)) == 1, changed
+    assert quoted.as_built(text, good) == text
+    other = good | {"valid_fraction": 0.988, "demo": {"mean_error_voxel": 0.261, "largest_displacement_voxel": 2.58}}
+    built = quoted.quotes(quoted.as_built(text, other))
+    assert built == said | {"valid": (99.0,), "error": (0.26,), "moved": (2.6,)}
+    assert quoted.differences(text, scene, other) == []  # another machine
 
 
 @pytest.mark.parametrize("file", [ExperimentTable, Scene])

@@ -1,6 +1,6 @@
 """Run ``lfpiv demo`` once, before the gallery is: its scripts read the results, the pages show its scene and report.
 
-The figures that the tutorial quotes are compared with that run; see `quoted`.
+The tutorial quotes the figures of that run; see `quoted`.
 """
 
 import importlib.resources
@@ -30,21 +30,36 @@ def prepare(app):
     shutil.copy(DEMO / "report.html", EXTRA / "demo-report.html")
 
 
-def _compare_with_the_tutorial():
-    """Warn, which ends a build with -W, where the tutorial quotes other figures than came out."""
-    import quoted
-    from sphinx.util import logging as sphinx_logging
-
+def _summary():
+    """Return the run's figures, with the errors against the truth, and its scene."""
     from lfpiv.cli import demo
     from lfpiv.simulation.scene import open_scene
 
     with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
-    summary = json.loads((DEMO / "summary.json").read_text("utf-8")) | {"demo": demo.compare_with_truth(scene, DEMO)}
+    return json.loads((DEMO / "summary.json").read_text("utf-8")) | {
+        "demo": demo.compare_with_truth(scene, DEMO)
+    }, scene
+
+
+def _compare_with_the_tutorial():
+    """Warn, which ends a build with -W, where the run is no longer the one that the tutorial describes."""
+    import quoted
+    from sphinx.util import logging as sphinx_logging
+
+    summary, scene = _summary()
     for text in quoted.differences(quoted.TUTORIAL.read_text("utf-8"), scene, summary):
         sphinx_logging.getLogger(__name__).warning(
             "tutorial.md quotes otherwise than the demonstration gives: %s", text
         )
+
+
+def quote(app, name, source):
+    """Put the figures of the run into the tutorial."""
+    import quoted
+
+    if name == quoted.TUTORIAL.stem:
+        source[0] = quoted.as_built(source[0], _summary()[0])
 
 
 def setup(app):
@@ -55,4 +70,5 @@ def setup(app):
     scene = importlib.resources.files("lfpiv.cli") / "demo_scene.toml"
     (DOCS / "generated" / "demo_scene.toml").write_text(scene.read_text("utf-8"), "utf-8")
     app.connect("builder-inited", prepare, priority=100)
+    app.connect("source-read", quote)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
