@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.errors import InputError
+from lfpiv.experiment import pixel_bytes
 from lfpiv.experiment.readers import davis
 from lfpiv.experiment.readers.source import SUFFIXES, CannotRead, Header, ImagePath, NotOneImage, split
 from lfpiv.settings.rig import RawImages
@@ -106,7 +107,7 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
     Raises
     ------
     InputError
-        If all pixels are equal, or values with fractions reach no further than `SCALED`.
+        If all pixels are equal, values with fractions reach no further than `SCALED`, or bytes are exchanged or noise.
     """
     low, high = float(image.min()), float(image.max())
     if high <= low or high <= 0:
@@ -117,6 +118,8 @@ def require_contrast(image: np.ndarray, path: Path, label: str) -> None:
             f"{path} ({label}): expected grey values in counts, found a scale of 0 to 1 ({low:.3g} to {high:.3g}). "
             "Save all images of this camera as it recorded them; or multiply all by its full scale, 4095 for 12 bits."
         )
+    if (found := pixel_bytes.fault(image)) is not None:
+        raise InputError(f"{path} ({label}): expected grey values as the camera recorded them, found {found}.")
 
 
 @contextlib.contextmanager

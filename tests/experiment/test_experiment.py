@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import tifffile
+from scipy import ndimage
 
 from lfpiv.errors import InputError
 from lfpiv.experiment import axes, images
@@ -198,6 +199,13 @@ def test_every_misspelt_key_finds_its_own(tiny_experiment, model):
             open_experiment(file)
 
 
+def smooth_light(shape):
+    """Light that neighbours share, of 12 bits, with noise."""
+    rng = np.random.default_rng(0)
+    spots = ndimage.gaussian_filter(rng.exponential(1, shape) ** 3, 2)
+    return np.clip(40 + 200 * spots + rng.normal(0, 3, shape), 0, 4095).round().astype(np.uint16)
+
+
 BAD_IMAGES = {
     "missing white": ("white/left.tif", lambda path: path.unlink(), ["white_image of camera 'left'", "no such file"]),
     "missing plane": (
@@ -259,6 +267,11 @@ BAD_IMAGES = {
         "white/left.tif",
         lambda path: tifffile.imwrite(path, np.random.default_rng(0).random((48, 64), np.float32)),
         ["counts", "0 to 1"],
+    ),
+    "exchanged bytes": (
+        "particles/left/0001b.tif",
+        lambda path: tifffile.imwrite(path, smooth_light((48, 64)).byteswap()),
+        ["pair 1", "two bytes are exchanged", "byte order"],
     ),
     "empty file": ("board/left/plane_00.tif", lambda path: path.write_bytes(b""), ["truncated", "empty"]),
     "no image": ("board/left/plane_00.tif", lambda path: path.write_text("text"), ["truncated or damaged"]),

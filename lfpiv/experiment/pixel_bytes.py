@@ -1,0 +1,54 @@
+"""Find images whose pixels of two bytes are not what the camera recorded: bytes exchanged, or a low byte of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+ALIKE = 0.3
+"""Correlation of neighbouring pixels after the exchange, above which they are alike."""
+UNLIKE = 1.5
+"""What correlation lacks from 1 as they are, relative to the same after the exchange, above which they are not."""
+ONE_HIGH_BYTE = 0.8
+"""Share of the pixels with one high byte among which the low byte is judged."""
+EVEN = 0.8
+"""Least of the counts of low bytes, relative to the largest, of noise."""
+
+_PIXELS = 300_000  # pixels that are compared, at most about
+_BINS = 16  # bins of the low byte
+_LEAST_PIXELS = 5000  # least number of pixels with one high byte
+_TWO_BYTES = 1 << 16
+
+
+def fault(image: np.ndarray) -> str | None:
+    """Return what is wrong with the bytes of an image, with the remedy; None for nothing.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Grey values as read [counts].
+    """
+    rows = image[:: 1 + image.size // _PIXELS]
+    low, high = float(rows.min()), float(rows.max())
+    if not (low >= 0 and 256 <= high < _TWO_BYTES) or (rows != np.rint(rows)).any():
+        return None
+    pixels = rows.astype(np.uint16)
+    alike, exchanged = _likeness(pixels), _likeness(pixels.byteswap())
+    if exchanged > ALIKE and 1 - alike > UNLIKE * (1 - exchanged):
+        return (
+            f"pixels whose two bytes are exchanged (neighbours correlate by {alike:.2f}, by {exchanged:.2f} after an "
+            "exchange). Save the image in the other byte order, or state byte_order in raw"
+        )
+    first = pixels >> 8
+    chosen = pixels[first == np.bincount(first.ravel()).argmax()]
+    counts = np.bincount((chosen & 255) * _BINS >> 8, minlength=_BINS)
+    if chosen.size > max(_LEAST_PIXELS, ONE_HIGH_BYTE * pixels.size) and counts.min() > EVEN * counts.max():
+        return "pixels whose low byte is noise: all its values are as frequent. Save the image again as recorded"
+    return None
+
+
+def _likeness(pixels: np.ndarray) -> float:
+    """Return the correlation of neighbours along the rows."""
+    values = pixels.astype(np.float32)
+    values -= values.mean()
+    power = float((values**2).mean(dtype=float))
+    return 1 - float((np.diff(values) ** 2).mean(dtype=float)) / (2 * power) if power > 0 else 0.0

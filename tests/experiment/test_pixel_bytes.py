@@ -1,0 +1,33 @@
+"""Images of two bytes a pixel: exchanged bytes and low bytes of noise are found, and nothing else is."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from lfpiv.experiment.pixel_bytes import fault
+
+SHAPE = (200, 300)
+
+
+@pytest.fixture(params=[0, 1, 2])
+def light(request):
+    """Spots on a dark level of 40 counts, 12 bits, noise of 3 counts."""
+    rng = np.random.default_rng(request.param)
+    spots = ndimage.gaussian_filter((rng.random(SHAPE) < 0.01) * rng.exponential(1, SHAPE), 2) * 30
+    return np.clip(40 + 3000 * spots + rng.normal(0, 3, SHAPE), 0, 4095).round().astype(np.uint16)
+
+
+def test_recorded_images_are_right(light):
+    rng = np.random.default_rng(9)
+    for sound in (light, light * 16, light // 16 * 256, light + rng.normal(0, 60, SHAPE), light / 7):
+        assert fault(np.maximum(sound, 0).astype(np.float32)) is None
+        assert fault(np.maximum(sound, 0).round().astype(np.float32)) is None
+    for noise in (rng.integers(0, 4096, SHAPE), rng.normal(2000, 300, SHAPE).round(), rng.integers(0, 256, SHAPE)):
+        assert fault(noise.astype(np.float32)) is None
+
+
+def test_exchanged_bytes_and_a_low_byte_of_noise_are_named(light):
+    for image in (light, light * 16):
+        assert "two bytes are exchanged" in fault(image.byteswap().astype(np.float32))
+    noise = np.random.default_rng(9).integers(0, 256, SHAPE)
+    assert "low byte is noise" in fault((256 * (light > 2000) + noise).astype(np.float32))
