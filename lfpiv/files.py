@@ -41,6 +41,7 @@ def size_text(size: int) -> str:
 
 def scratch_path(path: Path) -> Path:
     """Return the unique path of a file or folder beside `path` while this process writes it."""
+    path = Path(os.path.abspath(path))  # "." has no name
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import logging
@@ -141,7 +142,7 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         truth.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(folder.parent, f".{folder.name}.*.tmp")
+        remove_leftovers(folder.parent, f".{glob.escape(folder.name)}.*.tmp")
         scratch = scratch_path(folder)
         scratch.mkdir()
         try:
@@ -163,7 +164,7 @@ def _overlap(one: Path, other: Path) -> bool:
 
 def _move(source: Path, target: Path) -> None:
     """Move a folder, to another disk too; it appears under its name when it is complete."""
-    remove_leftovers(target.parent, f".{target.name}.*.tmp")
+    remove_leftovers(target.parent, f".{glob.escape(target.name)}.*.tmp")
     with replacing_folder(target) as near:
         shutil.move(source, near)
 

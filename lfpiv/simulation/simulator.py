@@ -6,11 +6,9 @@ windows, aberrations and faults. Images are rendered by rays, blurred, exposed, 
 
 from __future__ import annotations
 
+import glob
 import json
 import logging
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.errors import InputError
+from lfpiv.files import remove_leftovers, replacing_folder
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.simulation import truth
 from lfpiv.simulation.camera_images import (
@@ -98,19 +97,14 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: expected an empty or absent folder to write to, found files. Name another folder.")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
-    try:
+    remove_leftovers(out.parent, f".{glob.escape(out.name)}.*.tmp")
+    with replacing_folder(out) as scratch:
+        try:
+            scratch.mkdir(parents=True)
+        except OSError as error:
+            raise InputError(f"{out}: the folder cannot be written ({error.strerror}). Name another folder.") from None
         with ImageWriter(scratch) as files:
             _write(scene, pairs, instants, files, scratch, progress or ignore_progress)
-        scratch.chmod(0o755)
-        os.replace(scratch, out)
-    except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise
     return out / "experiment.toml"
 
 
