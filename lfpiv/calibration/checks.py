@@ -43,6 +43,8 @@ TURN_DEG = 20.0
 """Rotation from the nominal pose above which a warning is due [degree]."""
 MAGNIFICATION = 0.04
 """Relative difference from the stated magnification above which a warning is due."""
+LENS_PITCH = 0.03
+"""Relative difference from the stated pitch of the microlenses above which a warning is due."""
 EXPLAINED_PITCH = 0.2
 """Median residual of the thin lens below which its magnification is compared [microlens pitch]."""
 PUPIL_SCALE, PUPIL_SCALE_INCOMPLETE = 0.3, 0.1
@@ -71,7 +73,7 @@ FEWEST_PLANES = 2
 
 
 def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> None:
-    """Compare the diameter of the microimages with the stated aperture, and warn of saturation.
+    """Compare distance and diameter of the microimages with the stated optics, and warn of saturation.
 
     No other check finds a stated aperture that is larger than the true one.
 
@@ -80,6 +82,7 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
     InputError
         If the diameter differs by more than `OTHER_APERTURE`.
     """
+    _check_pitch(setup, decoder.lattice.pitch_mm / setup.optics.microlens_pitch_mm)
     seen, stated = microimage_px(white, dark, decoder), stated_px(setup.optics)
     difference = 0.0 if seen is None else max(seen / stated, stated / seen) - 1
     if seen is not None and difference > APERTURE:
@@ -99,6 +102,21 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
     share = saturated_share(white, setup.white_level, piles=noisy)
     if share > SATURATED:
         warn(log, Warning(code=Code.WHITE_SATURATED, subject=setup.name, figures={"share": share}))
+
+
+def _check_pitch(setup: CameraSetup, ratio: float) -> None:
+    """Warn if the microlenses' pitch in the white image over the stated one tells another pitch or pixel size."""
+    if abs(ratio - 1) > LENS_PITCH:
+        optics = setup.optics
+        figures = {
+            "seen_px": optics.microimage_pitch_px * ratio,
+            "stated_px": optics.microimage_pitch_px,
+            "microlens_pitch_mm": optics.microlens_pitch_mm,
+            "pixel_um": 1000 * optics.pixel_mm,
+            "fitting_mm": optics.microlens_pitch_mm * ratio,
+            "fitting_um": 1000 * optics.pixel_mm / ratio,
+        }
+        warn(log, Warning(code=Code.LENS_PITCH, subject=setup.name, figures=figures))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ class Code(enum.Enum):
     EMPTY = "empty"
     # white image and microlens array
     APERTURE = "aperture"
+    LENS_PITCH = "lens_pitch"
     WHITE_SATURATED = "white_saturated"
     LENSES_UNLIT = "lenses_unlit"
     LENSES_DISTORTED = "lenses_distorted"
@@ -121,6 +122,11 @@ SENTENCES: Mapping[Code, str] = {
         "the microimages are {seen_px:.1f} px wide, not {stated_px:.1f} px as f_number = {f_number:g} and "
         "microlens_focal_length_mm = {microlens_focal_length_mm:g} imply; f_number = {fitting:.3g} would fit. Check "
         "both, and the aperture of all images."
+    ),
+    Code.LENS_PITCH: (
+        "the microimages are {seen_px:.2f} px apart, not {stated_px:.2f} px as microlens_pitch_mm = "
+        "{microlens_pitch_mm:g} and pixel_um = {pixel_um:g} imply; pixel_um = {fitting_um:.3g} or microlens_pitch_mm = "
+        "{fitting_mm:.3g} would fit. Check both: magnification and aperture seem wrong where one of them is."
     ),
     Code.WHITE_SATURATED: (
         "{share:percent} % of the white image's bright pixels are saturated, so their response is not known; expose "
