@@ -56,7 +56,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     order = chain(first[:1], others[1:], first, experiment.numbers)
     tried = list(islice(experiment.disjoint(dict.fromkeys(order)), TRIED))
     shown = ShownParticles(experiment, weights.cameras, tried)
-    judged = _judge(shown, weights)
+    judged = _judge(shown if len(tried) > 1 else replace(shown, pairs=()), tried, weights)
     refusals = _refusals(experiment, names, judged)
     if refusals:
         return _told(
@@ -118,10 +118,10 @@ def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity, jud
     return text
 
 
-def _judge(shown: ShownParticles, weights: Weights) -> dict[int, Judgement]:
+def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dict[int, Judgement]:
     """Judge pairs until the images of one fit each other."""
     fit, judged = ImageFit(weights), dict[int, Judgement]()
-    for pair in shown.pairs:
+    for pair in pairs:
         try:
             shown.pair(pair)
             judged[pair] = judge(fit, shown, pair, *_shifts(shown.experiment, pair))
@@ -140,7 +140,7 @@ def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[
     """
     near = [late for late in NEIGHBOURS if pair + late in experiment.numbers]
     if experiment.series is None:
-        return near[:2], near[2:]
+        return near, []
     half = experiment.pairs // 2
     return [late for late in (half, -half) if half > 2 and pair + late in experiment.numbers], near
 
@@ -152,10 +152,12 @@ def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int,
     """
     each = {pair: one.mistakes for pair, one in judged.items() if one.mistakes}
     if judged and not any(one.fits for one in judged.values()):
-        shared = list(each.values()) or [reduce(Judgement.joined, judged.values()).mistakes]
+        shared = list(each.values()) or [reduce(Judgement.joined, judged.values()).mistakes] * len(judged)
         made = [one for one in shared[0] if all(one in others for others in shared)]
-        if made:
+        if made and 2 * len(shared) >= len(judged):
             return [_refusal(experiment, names, made)]
+        if 2 * len(each) < len(judged):
+            return []
     return [_numbered(experiment, _refusal(experiment, names, made), pair) for pair, made in each.items()]
 
 

@@ -29,8 +29,6 @@ TURN_LENSES = 3
 CLEAR = 4.0
 """Least advantage of images that fit over those of other particles, and of images without a mistake that is named over
 those with it [standard errors]."""
-BEYOND_CHANCE = 3.0
-"""Least advantage over chance of images without a mistake that is named [standard errors]."""
 SURE = 2.0
 """Disadvantage of all mistakes tried from which the images count as right without further trials [standard errors]."""
 
@@ -210,9 +208,21 @@ class Judgement:
         if not clear or clear[0] not in self.turned:
             return ()
         best = self.left[clear[0]]
-        if advantage(best, self.turned[clear[0]]) < BEYOND_CHANCE:
+        if not self._beats_chance(clear[0]):
             return ()
         return tuple(one for one in clear if advantage(best, self.left[one]) < SURE)
+
+    def _beats_chance(self, best: Mistake) -> bool:
+        """Return whether images without a mistake lie below those of other particles by more than these spread.
+
+        Images that do not fit differ by more than their standard errors, since what a particle leaves reaches over
+        several parts. So the spread of their light counts, too.
+        """
+        others = [self.left[one] for one in self.chance if one != best and one in self.left]
+        others += [self.turned[best]] if len(others) < 2 else []
+        count = min(len(frames) for frames in (*others, self.left[best]))
+        level, *chance = (sum(float(one.sum()) for one in frames[:count]) for frames in (self.left[best], *others))
+        return level < 2 * min(chance) - max(chance)
 
     @property
     def fits(self) -> bool:
@@ -287,7 +297,7 @@ def judge(
     shifts = [late for late in others if shown(pair + late, 0) is not None]
     chance = [Mistake(Kind.LATE, (name,), late) for late in shifts for name in _one_of_two(cameras)]
     if not chance:
-        chance = [Mistake(Kind.CHANCE, (name,)) for name in _one_of_two(cameras)]
+        chance = [Mistake(Kind.CHANCE, (name,)) for name in cameras]
     likely = [RIGHT, *chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
     found = try_frames(likely, 1)
     if found.in_order and not thorough:
