@@ -15,12 +15,6 @@ from scipy.spatial.transform import Rotation
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.warn import Warning
 
-KINDS = ("depth", "shift", "tilt", "rotation", "dots")
-"""Kinds of errors: planes along z, planes along x and y, planes about x and y, planes about z, dots on the board."""
-COMPONENTS = {"depth": (2,), "shift": (0, 1), "tilt": (3, 4), "rotation": (5,)}
-"""Components of a plane's six errors of each kind."""
-
-
 KINDS = {
     "depth": "depths of the planes",
     "shift": "shifts of the planes",
@@ -29,6 +23,8 @@ KINDS = {
     "dots": "places of the dots on the board",
 }
 """What the kinds of errors are called."""
+COMPONENTS = {"depth": (2,), "shift": (0, 1), "tilt": (3, 4), "rotation": (5,)}
+"""Components of a plane's six errors of each kind."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -42,7 +42,7 @@ class Effects:
         place = board.points_mm(0)[sites, :2]
         scatter = _complement(np.hstack([np.ones((len(sites), 1)), place]))
         bases = [(c, kind, shifts if c < 3 else rotations) for kind, part in COMPONENTS.items() for c in part]
-        bases.sort(key=lambda entry: KINDS.index(entry[1]))
+        bases.sort(key=lambda entry: list(KINDS).index(entry[1]))
         size = sum(basis.shape[1] for _, _, basis in bases) + 2 * scatter.shape[1]
         plane, site = np.zeros((len(board.planes_mm), 6, size)), np.zeros((board.size, 2, size))
         kinds: list[str] = []
