@@ -71,7 +71,7 @@ def simulate(folder: Path) -> None:
     (folder / "scene.toml").write_text(SCENE)
     command = [sys.executable, "-m", "lfpiv", "simulate", "scene.toml", "--out", "data"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=True)
 
 
 @cache
@@ -191,3 +191,5 @@ CALLS: dict[str, Callable[[], Work]] = {
     "call_rerun": _rerun,
 }
 """Name -> the function that prepares the call."""
+SIMULATED = CALLS.keys() - {"call_import", "call_correlate_8", "call_correlate_16"}
+"""Calls that need the simulated experiment."""

@@ -263,7 +263,7 @@ def main() -> int:
         runtime.start(given.device)
         return serve(given.serve) or 0 if given.serve else 1 - measure(given.measure)
 
-    from calls import CALLS, FOLDER, simulate
+    from calls import CALLS, FOLDER, SIMULATED, simulate
     from cases import CASES
 
     scales = ["paper"] if given.paper and not (given.small or given.all) else ["small"]
@@ -278,7 +278,7 @@ def main() -> int:
         names = given.case or [*(f"{op}_small" for op in COMPARED), *CALLS]
         with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder) / "base"
-            if set(names) & CALLS.keys():
+            if set(names) & SIMULATED:
                 simulate(Path(folder))
                 os.environ[FOLDER] = folder
             subprocess.run(

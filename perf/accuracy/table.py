@@ -254,8 +254,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 line = row(case, ours, base)
                 worse += line.endswith("worse")
                 print(line, flush=True)
-    if options.store:
-        STORED.write_text(json.dumps(stored | table, indent=1) + "\n")
+            if options.store:
+                kept = {case.label: (stored | table).get(case.label) for case in CASES}
+                STORED.write_text(json.dumps({label: one for label, one in kept.items() if one}, indent=1) + "\n")
     return int(worse > 0)
 
 

@@ -26,7 +26,7 @@ def test_errors_are_compared_pair_by_pair():
         assert not table.row(case, changed(same), STORED).endswith(("worse", "better"))
 
 
-def test_the_twelve_cases_differ_and_are_stored():
+def test_the_twelve_cases_differ_and_are_valid():
     labels = {case.label for case in table.CASES}
     assert len(labels) == len(table.CASES) == 12
     assert {case.cameras for case in table.CASES} == {1, 2, 3, 4}
