@@ -169,7 +169,15 @@ def _remedy(experiment: Experiment, names: list[str], what: str, flips: str) -> 
             f"the right as the cameras see it. Where a mirror is in the way, set {flips} instead; where x is meant to "
             f'point the other way, board.axes = "{other}".'
         )
-    return f"{seen} Set {flips}. If the pictures do lie as stated, {key} has the wrong sign. Compare: lfpiv check."
+    other = ", or the board images of two cameras are exchanged" if _facing(experiment, names) else ""
+    return f"{seen} Set {flips}. If the pictures do lie as stated, {key} has the wrong sign{other}. See `lfpiv check`."
+
+
+def _facing(experiment: Experiment, names: list[str]) -> bool:
+    """Return whether two cameras are stated where the mirror images of each other would be."""
+    stated = [one for name in names if (one := experiment.camera(name).orientation) is not None]
+    mirror = Mistake(left_right=True).mirror
+    return any(turn_deg(mirror @ one.rotation, other.rotation) < ALIKE_DEG for one, other in combinations(stated, 2))
 
 
 def _same_place(experiment: Experiment, names: list[str], others: list[str]) -> bool:
