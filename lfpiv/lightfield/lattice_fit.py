@@ -245,8 +245,8 @@ def _correlate(image: np.ndarray, white: np.ndarray, pixels: np.ndarray) -> np.n
     folds = [part.sum(axis=0) / count for part in (image, white)]
     first, second = (fold - fold.mean() for fold in folds)
     power = float((first**2).sum() * (second**2).sum()) ** 0.5
-    product: np.ndarray = np.fft.ifft2(np.fft.fft2(first) * np.fft.fft2(second).conj()).real
-    return product / max(power, 1e-30)
+    product: np.ndarray = np.fft.ifft2(np.fft.fft2(first) * np.fft.fft2(second).conj()).real / max(power, 1e-30)
+    return product
 
 
 def _highest(correlation: np.ndarray) -> tuple[np.ndarray, float]:

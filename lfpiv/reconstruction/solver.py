@@ -122,12 +122,11 @@ class SmartSolver:
         if not all(self._sees_alone(name) for name in self.weights.cameras):
             sets = 1
         if self.weights.has_ray_rows and sets > 1:
-            count = wanted
             if isinstance(wanted, str):
-                count = sets if self.settings.allows_subsets and rows_resolve_depth(self.weights) else 1
-            if count > sets:
-                raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {count}.")
-            return joint_subsets(cameras, sets, count) if count > 1 else subsets_of(1)
+                wanted = sets if self.settings.allows_subsets and rows_resolve_depth(self.weights) else 1
+            if wanted > sets:
+                raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {wanted}.")
+            return joint_subsets(cameras, sets, wanted) if wanted > 1 else subsets_of(1)
         possible = sorted({1, cameras, sets * cameras})
         if isinstance(wanted, str):
             few = cameras <= FEW_CAMERAS or sets == 1

@@ -100,5 +100,5 @@ def _arrows(axes: Axes, middle: np.ndarray, tips: Sequence[np.ndarray]) -> None:
     for name, colour, tip in zip("xy", (X_COLOUR, Y_COLOUR), tips, strict=True):
         shape = {"arrowstyle": "-|>", "color": colour, "lw": 2.2, "mutation_scale": 16}
         axes.annotate("", xy=tuple(tip), xytext=tuple(middle), arrowprops=shape)
-        place = middle + 1.15 * (tip - middle)
-        axes.text(*place, name, color=colour, fontsize=13, weight="bold", ha="center", va="center")
+        x, y = middle + 1.15 * (tip - middle)
+        axes.text(x, y, name, color=colour, fontsize=13, weight="bold", ha="center", va="center")
