@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -41,6 +42,7 @@ from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
 from lfpiv.experiment import axes
 from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.warn import collected
@@ -48,15 +50,15 @@ from lfpiv.warn import collected
 log = logging.getLogger(__name__)
 
 
-def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> Calibration:
+def calibrate(experiment: Experiment | str | Path, progress: StepProgress | None = None) -> Calibration:
     """Calibrate every camera of an experiment from its white and board images (section 3.1 of the paper).
 
     The mapping does not depend on the nominal orientations. They only help to number the board's dots.
 
     Parameters
     ----------
-    experiment : Experiment
-        From `open_experiment`.
+    experiment : Experiment or path
+        From `open_experiment`, or the experiment file, whose particle images are not looked at.
     progress : callable, optional
         Called with the finished fraction.
 
@@ -67,9 +69,11 @@ def calibrate(experiment: Experiment, progress: StepProgress | None = None) -> C
     Raises
     ------
     InputError
-        If a white image shows no microlens array or the board's dots cannot be found. Names camera and file.
+        If the experiment file is not as expected, a white image shows no microlens array, or the board's dots cannot be
+        found. Names camera and file.
     """
-    return calibrate_or_continue(experiment, None, progress)
+    opened = experiment if isinstance(experiment, Experiment) else read_experiment(experiment)
+    return calibrate_or_continue(opened, None, progress)
 
 
 def calibrate_or_continue(

@@ -61,7 +61,7 @@ def rig(tmp_path_factory, device):
     (folder / "scene.toml").write_text(SCENE)
     experiment = lfpiv.open_experiment(simulate(folder / "scene.toml", folder / "data"))
     spec = json.loads((folder / "data" / "truth" / "spec.json").read_text())["camera"][0]
-    return experiment, spec, lfpiv.calibrate(experiment)
+    return experiment, spec, lfpiv.calibrate(experiment.path)  # from its file, as scripts do
 
 
 def test_the_mapping_meets_the_true_rays(rig):
