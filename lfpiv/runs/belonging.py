@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
-from lfpiv.selfcalibration.belonging import FLIPS, SURE, ImageFit, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration.belonging import FLIPS, IN_TIME, SURE, ImageFit, Judgement, Kind, Mistake, judge
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL
 from lfpiv.warn import Code, Warning, name_pairs
 
@@ -82,7 +82,7 @@ def refusals_of(shown: ShownParticles, fit: ImageFit, pair: int) -> list[Warning
     experiment, names = shown.experiment, list(shown.cameras)
     try:
         light = shown.pair(pair)
-        found = judge(fit, shown, pair, *_shifts(experiment, pair), thorough=True)
+        found = judge(fit, shown, pair, *_shifts(experiment, pair), images=_images(experiment), thorough=True)
     except ValueError as error:  # its images were there before
         log.debug("images of %s are not compared: %s", experiment.name_of(pair), error)
         return []
@@ -124,7 +124,7 @@ def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dic
     for pair in pairs:
         try:
             shown.pair(pair)
-            judged[pair] = judge(fit, shown, pair, *_shifts(shown.experiment, pair))
+            judged[pair] = judge(fit, shown, pair, *_shifts(shown.experiment, pair), images=_images(shown.experiment))
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
             log.debug("images of %s are not compared: %s", shown.experiment.name_of(pair), error)
             continue
@@ -143,6 +143,11 @@ def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[
         return near, []
     half = experiment.pairs // 2
     return [late for late in (half, -half) if half > 2 and pair + late in experiment.numbers], near
+
+
+def _images(experiment: Experiment) -> Sequence[int]:
+    """Return the single images by which a camera may be late; in a series these are instants."""
+    return (1, -1) if experiment.series is None else ()
 
 
 def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
@@ -171,7 +176,7 @@ def _refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistak
     best = made[0]
     alike = [one for one in made if one.kind is best.kind and one.late == best.late]
     cameras = list(dict.fromkeys(name for one in alike for name in one.cameras))
-    if best.kind in (Kind.FRAMES, Kind.LATE) and len(names) == 2:
+    if best.kind in IN_TIME and len(names) == 2:
         cameras = list(names)
     text, remedy = _words(experiment, best, cameras)
     return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy})
@@ -200,12 +205,12 @@ def _words(experiment: Experiment, mistake: Mistake, cameras: Sequence[str]) -> 
         return f"the particle images of {either} are mirrored {how}", (
             f"Set {keys} if white and board images are mirrored, too; otherwise store the particle images as those are"
         )
-    noun = experiment.noun
+    noun = "image" if mistake.kind is Kind.SHIFTED else experiment.noun
     count = f"{abs(mistake.late)} {noun}{'s' if abs(mistake.late) > 1 else ''}"
     when, other = ("late", "early") if mistake.late > 0 else ("early", "late")
     text = f"the images of {cameras[0]} are {count} {when}"
     text += f", or those of {cameras[1]} {other}" if len(cameras) == 2 else ""
-    return text, f"Give images of the same instant the same number of {noun}"
+    return text, f"Give images of the same instant the same {experiment.noun} and frame"
 
 
 def _flipped(known: str, kind: Kind) -> str:

@@ -52,11 +52,13 @@ class Kind(enum.Enum):
     BOTH = "both"
     LATE = "late"
     """The images of one camera are of another pair."""
+    SHIFTED = "shifted"
+    """The images of one camera are late by single images, so that its second frames stand as first ones."""
     CHANCE = "chance"
     """The images of one camera are turned by half a turn: no mistake, but a measure of chance."""
 
 
-IN_TIME = (Kind.FRAMES, Kind.LATE)
+IN_TIME = (Kind.FRAMES, Kind.LATE, Kind.SHIFTED)
 """Mistakes that replace images by others of the same camera."""
 FLIPS: Mapping[Kind, tuple[slice, slice]] = {
     Kind.HORIZONTAL: (slice(None), slice(None, None, -1)),
@@ -73,7 +75,7 @@ class Mistake:
     cameras: tuple[str, ...] = ()
     """The camera whose images are wrong, or the two whose images are exchanged."""
     late: int = 0
-    """Pairs by which the images of the camera are late; negative: early."""
+    """Pairs, or single images, by which the images of the camera are late; negative: early."""
 
     @property
     def named(self) -> bool:
@@ -93,7 +95,7 @@ class Mistake:
         if self.kind in FLIPS:
             return {**images, name: np.ascontiguousarray(images[name][FLIPS[self.kind]])}
         at = (pair, 1 - frame) if self.kind is Kind.FRAMES else (pair + self.late, frame)
-        other = shown(*at)
+        other = shown(*(divmod(2 * pair + frame + self.late, 2) if self.kind is Kind.SHIFTED else at))
         return None if other is None else {**images, name: other[name]}
 
 
@@ -107,10 +109,14 @@ def likely_mistakes(cameras: Sequence[str]) -> list[Mistake]:
     return found + [Mistake(Kind.HORIZONTAL, (name,)) for name in cameras]
 
 
-def other_mistakes(cameras: Sequence[str], shifts: Iterable[int]) -> list[Mistake]:
-    """Return the mistakes that are tried where images do not fit clearly, among them `shifts` of a camera in time."""
+def other_mistakes(cameras: Sequence[str], shifts: Iterable[int], images: Iterable[int] = ()) -> list[Mistake]:
+    """Return the mistakes that are tried where images do not fit clearly.
+
+    Among them are shifts of a camera in time, by pairs or instants (`shifts`) and by single `images`.
+    """
     found = [Mistake(kind, (name,)) for kind in (Kind.VERTICAL, Kind.BOTH) for name in cameras]
-    return found + [Mistake(Kind.LATE, (name,), late) for late in shifts for name in _one_of_two(cameras)]
+    in_time = [(Kind.LATE, late) for late in shifts] + [(Kind.SHIFTED, late) for late in images]
+    return found + [Mistake(kind, (name,), late) for kind, late in in_time for name in _one_of_two(cameras)]
 
 
 def _one_of_two(cameras: Sequence[str]) -> Sequence[str]:
@@ -213,16 +219,19 @@ class Judgement:
         return tuple(one for one in clear if advantage(best, self.left[one]) < SURE)
 
     def _beats_chance(self, best: Mistake) -> bool:
-        """Return whether images without a mistake lie below those of other particles by more than these spread.
+        """Return whether images without a mistake fit clearly better than those of other particles.
 
         Images that do not fit differ by more than their standard errors, since what a particle leaves reaches over
-        several parts. So the spread of their light counts, too.
+        several parts. So the spread of their light counts, too. If a camera is late, the images as they are show other
+        particles as well. Turned images leave more light than those of other particles, so they are the last resort.
         """
         others = [self.left[one] for one in self.chance if one != best and one in self.left]
-        others += [self.turned[best]] if len(others) < 2 else []
+        others += [self.left[RIGHT]] if best.kind in (Kind.LATE, Kind.SHIFTED) else []
+        others = others or [self.turned[best]]
         count = min(len(frames) for frames in (*others, self.left[best]))
         level, *chance = (sum(float(one.sum()) for one in frames[:count]) for frames in (self.left[best], *others))
-        return level < 2 * min(chance) - max(chance)
+        clear = all(advantage(self.left[best], frames) > CLEAR for frames in others)
+        return clear and level < 2 * min(chance) - max(chance)
 
     @property
     def fits(self) -> bool:
@@ -257,7 +266,14 @@ class Judgement:
 
 
 def judge(
-    fit: ImageFit, shown: Shown, pair: int, others: Sequence[int], near: Sequence[int], *, thorough: bool = False
+    fit: ImageFit,
+    shown: Shown,
+    pair: int,
+    others: Sequence[int],
+    near: Sequence[int],
+    *,
+    images: Sequence[int] = (),
+    thorough: bool = False,
 ) -> Judgement:
     """Judge the images of a pair.
 
@@ -274,6 +290,8 @@ def judge(
     others, near : sequence of int
         Distances of pairs that show other particles, the one to compare with first, and of others that may be mistaken
         for the pair.
+    images : sequence of int
+        Single images by which a camera may be late.
     thorough : bool
         Try all mistakes in any case.
 
@@ -289,8 +307,8 @@ def judge(
         for frame in range(count):
             for one in mistakes:
                 tried = left.setdefault(one, [])
-                if len(tried) == frame and (images := one.undone(shown, pair, frame)) is not None:
-                    tried.append(fit.unexplained(images, one.cameras[0] if one.kind is Kind.CHANCE else None))
+                if len(tried) == frame and (right := one.undone(shown, pair, frame)) is not None:
+                    tried.append(fit.unexplained(right, one.cameras[0] if one.kind is Kind.CHANCE else None))
         known = {one: tried for one, tried in left.items() if tried}
         return Judgement(known, [one for one in chance if one in known])
 
@@ -308,10 +326,10 @@ def judge(
         each = [advantage(left[RIGHT][at : at + 1], left[one][at : at + 1]) for one in ordering[1:] for at in (0, 1)]
         if found.fits and min(each) > -SURE:
             return found
-    found = try_frames([*likely, *chance, *other_mistakes(cameras, near)], 2)
+    found = try_frames([*likely, *chance, *other_mistakes(cameras, near, images)], 2)
     best = found.tried[0]
     if found.margin(best) > -SURE:
         return found
-    undone = [images for frame in (0, 1) if (images := best.undone(shown, pair, frame)) is not None]
-    turned = {best: [fit.unexplained(images, best.cameras[0]) for images in undone]}
+    undone = [right for frame in (0, 1) if (right := best.undone(shown, pair, frame)) is not None]
+    turned = {best: [fit.unexplained(right, best.cameras[0]) for right in undone]}
     return Judgement(found.left, found.chance, turned)
