@@ -4,7 +4,6 @@ import csv
 import json
 import logging
 import os
-import types
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ import lfpiv
 from lfpiv import derived
 from lfpiv.cli import commands
 from lfpiv.errors import StorageError
-from lfpiv.results import datasets, export, netcdf
+from lfpiv.results import export, netcdf
 
 NUMBERS = (0, 2, 3)
 SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
@@ -211,15 +210,6 @@ def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
             lfpiv.export_results(folder, to, out=tmp_path / name)
     assert {path.name: path.read_bytes() for path in (tmp_path / "old").iterdir()} == before
     assert not any((tmp_path / "new").iterdir())
-
-
-def test_a_full_disk_is_refused_before_the_netcdf_library_writes(run, tmp_path, monkeypatch):
-    free = lfpiv.open_results(run[0]).nbytes // 2  # a plane takes less than that, all pairs take more
-    monkeypatch.setattr(datasets.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
-    with pytest.raises(StorageError, match=r"(?i)no space left"):
-        lfpiv.export_results(run[0], "netcdf", out=tmp_path)
-    assert not any(tmp_path.iterdir())
-    assert lfpiv.export_results(run[0], "pivpy", out=tmp_path)
 
 
 def test_the_command_writes_and_prints_the_path(run, tmp_path, capfd):
