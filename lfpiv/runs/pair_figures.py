@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,8 @@ class PairFigures:
     """Part of the volume that holds no particles."""
     moved_voxel: float | None = None
     """Median length of the displacements of the valid vectors; None in files that do not state it."""
+    flow_voxel: Sequence[float] | None = None
+    """Mean displacement of the valid vectors, along x, y, z in each eighth of the volume, 0 where there are none."""
     motion: MotionFigures | None = None
     """None without motion passes."""
     residual: Mapping[str, Sequence[float]] | None = None
@@ -168,11 +171,22 @@ def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterabl
         correlation_s=float(vectors.attrs["correlation_s"]),
         velocity_m_per_s={name: _spread(vectors[name].values[valid & finite]) for name in ("u", "v", "w")},
         moved_voxel=_median(np.sqrt(sum(vectors[name].values[valid & finite] ** 2 for name in _DISPLACEMENTS))),
+        flow_voxel=flow_in_eighths(vectors, valid & finite),
         uncertainty_voxel=_median(vectors["uncertainty"].values[valid]),
         peak_ratio=_median(vectors["peak_ratio"].values[valid]),
         motion=_motion(vectors.attrs) if "motion" in vectors.attrs else None,
         **known,
     )
+
+
+def flow_in_eighths(vectors: xr.Dataset, counts: np.ndarray) -> list[float]:
+    """Return the mean displacements of the vectors that count in eighths of the volume, to four digits."""
+    halves = [(slice(0, -(-n // 2)), slice(n // 2, n)) for n in counts.shape]
+    means = []
+    for name, part in product(_DISPLACEMENTS, product(*halves)):
+        chosen = vectors[name].values[part][counts[part]]
+        means.append(round(float(chosen.mean()), 4) if len(chosen) else 0.0)
+    return means
 
 
 def _motion(attributes: Mapping[str, Any]) -> MotionFigures:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import xarray as xr
 
-from lfpiv.errors import InputError
 from lfpiv.reconstruction.bootstrap import evenly_spread
+from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.warn import Code, Warning
-
-log = logging.getLogger(__name__)
 
 MOST = 500
 """Largest number of pairs that are compared; of more, these are evenly spread."""
@@ -26,49 +22,38 @@ FEW = 0.1
 """Largest share of reversed pairs, where it is more than one: a flow that oscillates has more."""
 
 
-def reversed_pairs(pairs: Sequence[int], read: Callable[[int], xr.Dataset]) -> list[Warning]:
+def reversed_pairs(figures: Mapping[int, PairFigures]) -> list[Warning]:
     """Return the warning about pairs whose flow runs against that of the others; empty without any.
 
-    Parameters
-    ----------
-    pairs : sequence of int
-        Pairs with vectors.
-    read : callable
-        Returns the vectors of a pair; raises InputError if they cannot be read.
+    `figures` are those of the pairs with vectors.
     """
-    likeness = _likeness(evenly_spread(list(pairs), MOST), read)
+    likeness = _likeness(evenly_spread(list(figures), MOST), figures)
     if len(likeness) < 2 or np.median(np.abs(list(likeness.values()))) < ALIKE:
         return []
     negative = [pair for pair, value in likeness.items() if value < -ALIKE]
     if not negative:
         return []
-    figures = {"others": f"that of the other {len(likeness) - len(negative)}"}
     if len(likeness) == 2:
         return [Warning(code=Code.REVERSED, pairs=tuple(likeness), figures={"others": "each other"})]
     if len(negative) > max(1, FEW * len(likeness)):
         return []
-    return [Warning(code=Code.REVERSED, pairs=tuple(negative), figures=figures)]
+    others = {"others": f"that of the other {len(likeness) - len(negative)}"}
+    return [Warning(code=Code.REVERSED, pairs=tuple(negative), figures=others)]
 
 
-def _likeness(pairs: Sequence[int], read: Callable[[int], xr.Dataset]) -> dict[int, float]:
-    """Return the cosine of each pair's displacements with those that most pairs have, which are along them."""
+def _likeness(pairs: Sequence[int], figures: Mapping[int, PairFigures]) -> dict[int, float]:
+    """Return the cosine of each pair's mean displacements with those that most pairs have, which are along them."""
 
     def field(pair: int) -> np.ndarray | None:
-        try:
-            vectors = read(pair)
-        except InputError as error:
-            log.debug("flow of pair %d is not compared: %s", pair, error)
+        one = figures[pair]
+        if one.flow_voxel is None or one.valid_fraction < LEAST_VALID:
             return None
-        valid = vectors["valid"].values
-        if valid.mean() < LEAST_VALID:
-            return None
-        parts = [np.where(valid, vectors[f"displacement_{axis}"].values, 0) for axis in "xyz"]
-        found = np.stack(parts).ravel().astype(np.float64)
+        found = np.array(one.flow_voxel)
         length = float(np.linalg.norm(found))
         return found / length if length > 0 else None
 
     chosen = {pair: known for pair in evenly_spread(list(pairs), REFERENCE) if (known := field(pair)) is not None}
-    if len({known.shape for known in chosen.values()}) != 1:
+    if not chosen:
         return {}
     fields = np.stack(list(chosen.values()))
     share = np.linalg.eigh(fields @ fields.T)[1][:, -1]  # of each in what they have in common, but for the sign
@@ -78,6 +63,6 @@ def _likeness(pairs: Sequence[int], read: Callable[[int], xr.Dataset]) -> dict[i
     found = {}
     for pair in pairs:
         known = chosen[pair] if pair in chosen else field(pair)
-        if known is not None and known.shape == common.shape:
+        if known is not None:
             found[pair] = float(known @ common)
     return found

@@ -24,7 +24,7 @@ from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import finished, netcdf, provenance, stamps, summary_file
+from lfpiv.results import finished, provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -371,7 +371,7 @@ class Run:
 
     def _reversed(self, contents: Contents) -> list[Warning]:
         """Log and return the warning about pairs whose flow runs against that of the others."""
-        found = reversed_pairs(list(contents.vectors), lambda pair: netcdf.read_vectors(self.folder.vectors(pair)))
+        found = reversed_pairs(contents.vectors)
         for warning in found:
             log.warning("%s", warning.sentence)
         return found

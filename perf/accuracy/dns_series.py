@@ -39,6 +39,7 @@ from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline
 from lfpiv.runs.pair_volumes import Reconstructor
+from lfpiv.selfcalibration.belonging import ImageFit
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
@@ -123,7 +124,7 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
     counts = Counts()
 
     def prepare(of: Any, self: SmartSolver, images: Mapping[str, np.ndarray], **options: Any) -> Any:
-        if len(self.weights.cameras) == cameras:  # the check for moved cameras reconstructs from one at a time
+        if len(self.weights.cameras) == cameras:  # disparities are measured in volumes of one camera
             digest = hashlib.sha256()
             for name in sorted(images):
                 digest.update(np.ascontiguousarray(images[name]).tobytes())
@@ -152,6 +153,12 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
         counts.passes += share * (len(views) == cameras)
         return of(views, *arguments, **part)
 
+    def uncounted(of: Any, *arguments: Any) -> Any:
+        before = counts.instants.copy(), counts.passes
+        found = of(*arguments)
+        counts.instants, counts.passes = before
+        return found
+
     def timed(of: Any, *arguments: Any) -> Any:
         start = time.process_time()
         found = of(*arguments)
@@ -166,6 +173,7 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
             (ImageEquations, "compare_part", part),
             (ImageEquations, "exponent_of", back),
             (instant, "multiplicative_guess", guess),
+            (ImageFit, "unexplained", uncounted),  # the check of the cameras
             (Reconstructor, "instant", timed),
             (Reconstructor, "follow", timed),
             (Reconstructor, "correct", timed),

@@ -56,7 +56,7 @@ def experiment_of(scene, folder, *, stated=True, flip=None):
     if not stated:
         lines = [line for line in lines if not line.startswith("nominal_")]
     if flip:
-        lines = [f'image_flip = "{flip}"\n{line}' if line.startswith("white_image") else line for line in lines]
+        lines = [f'image_flip = "{flip}"' if line.startswith("image_flip") else line for line in lines]
     path.write_text("\n".join(lines), "utf-8")
     return lfpiv.open_experiment(path)
 

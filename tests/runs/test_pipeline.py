@@ -38,7 +38,9 @@ def test_the_flow_comes_out(finished):
     _, out, summary = finished
     moved = summary["pairs"][0]["moved_voxel"]
     assert moved == pytest.approx(np.linalg.norm(DISPLACEMENT_VOXEL), abs=TOLERANCE_VOXEL)
-    row = f"Median movement.*{moved:.3g} voxel = {100 * moved:.3g} um in 1 ms, {100 * moved:.3g} mm/s, in pair 0"
+    flow = np.reshape(summary["pairs"][0]["flow_voxel"], (3, 8)).mean(axis=1)
+    assert flow == pytest.approx(DISPLACEMENT_VOXEL, abs=TOLERANCE_VOXEL)
+    row = f"Median movement.*{moved:.3g} voxel = {100 * moved:.3g} um in 1 ms, {moved / 10:.3g} m/s, in pair 0"
     assert re.search(row, (out / "report.html").read_text("utf-8"))
     for pair in range(PAIRS):
         vectors = netcdf.read_vectors(out / "vectors" / f"pair_{pair:04d}.nc")

@@ -1,13 +1,14 @@
 """Images of cameras that do not belong together: found, named, and refused with their pairs."""
 
 import functools
+import types
 
 import numpy as np
 import pytest
 import xarray as xr
 
 import lfpiv
-from lfpiv.runs import belonging, pipeline
+from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.runs.reversed_pairs import reversed_pairs
 from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Kind, Mistake, judge
@@ -107,12 +108,14 @@ def test_a_pair_whose_frames_are_exchanged_in_one_camera_is_refused(small_run, t
     assert any(one["code"] == Code.MISMATCHED.value for one in again["warning_records"])
 
 
-def vectors_of(displacement, scatter, seed):
+def figures_of(displacement, scatter, seed):
     noise = np.random.default_rng(seed).standard_normal((3, 4, 5, 6))
     moved = np.asarray(displacement) + scatter * noise
-    dims = ("z", "y", "x")
-    found = {f"displacement_{axis}": (dims, part) for axis, part in zip("xyz", moved, strict=True)}
-    return xr.Dataset(found | {"valid": (dims, np.ones((4, 5, 6), bool))})
+    vectors = xr.Dataset(
+        {f"displacement_{axis}": (("z", "y", "x"), part) for axis, part in zip("xyz", moved, strict=True)}
+    )
+    flow = pair_figures.flow_in_eighths(vectors, np.ones((4, 5, 6), bool))
+    return types.SimpleNamespace(flow_voxel=flow, valid_fraction=1.0)
 
 
 ROTATION = np.stack([-np.indices((4, 5, 6))[1] + 2.0, np.indices((4, 5, 6))[2] - 2.5, np.zeros((4, 5, 6))])
@@ -121,11 +124,8 @@ ROTATION = np.stack([-np.indices((4, 5, 6))[1] + 2.0, np.indices((4, 5, 6))[2] -
 @pytest.mark.parametrize(("count", "scatter"), [(2, 0.1), (3, 0.5), (60, 0.5)])
 def test_a_pair_whose_flow_runs_against_the_others_is_named(count, scatter):
     wrong = count - 1
-
-    def read(pair):
-        return vectors_of(-ROTATION if pair == wrong else ROTATION, scatter, pair)
-
-    (found,) = reversed_pairs(range(count), read)
+    figures = {pair: figures_of(-ROTATION if pair == wrong else ROTATION, scatter, pair) for pair in range(count)}
+    (found,) = reversed_pairs(figures)
     assert (
         found.pairs == ((0, 1) if count == 2 else (wrong,)) and "the frames of a pair are exchanged" in found.sentence
     )
@@ -133,7 +133,7 @@ def test_a_pair_whose_flow_runs_against_the_others_is_named(count, scatter):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 60])
 def test_flows_that_fluctuate_or_oscillate_are_not_reversed(count):
-    assert not reversed_pairs(range(count), lambda pair: vectors_of(0 * ROTATION, 1.0, pair))
-    assert not reversed_pairs(range(count), lambda pair: vectors_of(ROTATION, 1.0, pair))
+    assert not reversed_pairs({pair: figures_of(0 * ROTATION, 1.0, pair) for pair in range(count)})
+    assert not reversed_pairs({pair: figures_of(ROTATION, 1.0, pair) for pair in range(count)})
     if count > 3:
-        assert not reversed_pairs(range(count), lambda pair: vectors_of((-1) ** pair * ROTATION, 0.1, pair))
+        assert not reversed_pairs({pair: figures_of((-1) ** pair * ROTATION, 0.1, pair) for pair in range(count)})
