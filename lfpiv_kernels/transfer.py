@@ -94,6 +94,12 @@ def duplicate(array: wp.array) -> wp.array:
     return to_device(to_host(array).copy(), array.dtype)
 
 
+def block(values: Given, part: tuple[slice, ...]) -> Given:
+    """Return a contiguous copy of a part of an array, on the same device."""
+    cut = values[part]
+    return cut.contiguous() if isinstance(cut, wp.array) else np.ascontiguousarray(cut)
+
+
 def host_bytes(size: int, *, locked: bool) -> wp.array:
     """Return memory of the host [byte], page-locked for copies to a GPU if asked for and CUDA allows it."""
     if locked and runtime.device().kind == "cuda":

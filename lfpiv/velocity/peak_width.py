@@ -13,7 +13,7 @@ from lfpiv.velocity.settings import REFINE_SEARCH, Triple
 from lfpiv_kernels.correlation import sums
 from lfpiv_kernels.correlation.correlate import PEAK_REACH
 from lfpiv_kernels.correlation.light import fluctuation
-from lfpiv_kernels.transfer import Values, to_host
+from lfpiv_kernels.transfer import Values, block
 
 OWN = 0.2
 """Autocorrelation of the volumes below which a lag no longer belongs to a peak."""
@@ -58,10 +58,11 @@ def _blocks(volume: Values) -> list[Values]:
     edges = [min(n, BLOCK) for n in volume.shape]
     if len(PLACES) * math.prod(edges) >= math.prod(volume.shape):
         return [volume]
-    corners = [
+    starts = [
         [round(at * (n - edge)) for at, n, edge in zip(place, volume.shape, edges, strict=True)] for place in PLACES
     ]
-    return [to_host(volume[z : z + edges[0], y : y + edges[1], x : x + edges[2]]) for z, y, x in corners]
+    parts = [tuple(slice(a, a + edge) for a, edge in zip(start, edges, strict=True)) for start in starts]
+    return [block(volume, part) for part in parts]
 
 
 def refine_search(reach: int) -> Triple:
