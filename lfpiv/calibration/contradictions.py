@@ -68,7 +68,7 @@ def warn_unstated(experiment: Experiment) -> None:
 
 
 def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
-    """Return what explains the board images of all cameras better than the stated rig, as a message; None if nothing.
+    """Name the mistake that explains all board images better than the stated rig, as a message; None without one.
 
     A board with a mark names its dots by itself and is left out.
     """
@@ -112,7 +112,7 @@ def _exchanged(experiment: Experiment, found: Mapping[str, Mistake], decoders: M
 
 
 def _planes(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
-    """Name planes whose depths are stated in another order or with another sign; "" if there are none."""
+    """Name planes with a wrong order or sign of their depths; "" without any."""
     names = [name for name, mistake in found.items() if mistake.planes]
     if not names:
         return ""
@@ -129,7 +129,7 @@ def _planes(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
 
 
 def _mirrors(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
-    """Name cameras whose pictures lie otherwise than stated, with the remedy; "" if there are none."""
+    """Name cameras with another orientation or flip than stated, with the remedy; "" without any."""
     sentences = []
     for left_right, up_down in ((True, False), (False, True), (True, True)):
         names = [name for name, one in found.items() if (one.left_right, one.up_down) == (left_right, up_down)]

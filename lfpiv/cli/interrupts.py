@@ -25,7 +25,7 @@ REPEAT_S = 0.2
 """Time after which a swallowed interrupt is repeated [s]."""
 
 ANSWER_S = 1.5
-"""Longest time that the main thread may take to answer a signal before the process is ended [s]."""
+"""Time to answer a signal, after which the process is ended [s]."""
 
 POLL_S = 0.02
 """Time between looks at whether the main thread answered [s]."""

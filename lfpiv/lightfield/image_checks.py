@@ -19,7 +19,6 @@ from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
 from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
-from lfpiv.lightfield.saturation import saturated_pixels as saturated_pixels
 from lfpiv.warn import Code, Warning
 
 GAP_LIGHT = 0.1
@@ -43,9 +42,7 @@ _CORE_PITCHES = 0.15  # radius in which a microimage is evenly bright
 _LIT_LENS = 0.3  # least light of a lit lens, relative to the median
 _WHOLE_LENS = 0.8  # least number of pixels of a whole microimage, relative to the median
 _RING_PX = 0.25  # width of the rings of a microimage's profile
-_OUTERMOST = (
-    100  # the outermost hundredth of the pixels of microimages gives the dark level of an image without another
-)
+_OUTERMOST = 100  # without a dark image the outermost hundredth of the pixels of microimages gives the dark level
 _DISC_REACH_PX, _DISCS = 2.0, 60  # reach and number of the radii of discs tried, below the half width of the profile
 _LEAST_BLUR_PX, _LARGEST_BLUR_PX, _BLURS = 0.3, 1.5, 10  # standard deviations of the blur tried; a pixel's own is 0.29
 _MODEL_ERROR = 0.01  # of the profile of a blurred disc, relative to its core, root mean square

@@ -92,7 +92,7 @@ def contrast(
 def likely_mistake(
     signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation
 ) -> Mistake | None:
-    """Return the mistake that fits the dots of a camera clearly best, `RIGHT` if what is stated does, None if none."""
+    """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly."""
     tried = mistakes(orientation, board.planes_mm)
     found = [contrast(signals, decoder, board, orientation, mistake) for mistake in tried]
     best = int(np.argmax(found))
