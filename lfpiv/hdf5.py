@@ -4,8 +4,8 @@ The seal is a line behind the last byte that HDF5 uses. It holds a digest of all
 name and attribute. HDF5 ignores what follows its end, and cuts it off when a program changes the file. Verifying reads
 the bytes once, in parts, and parses nothing that has not been found whole.
 
-A file of an earlier version has no seal. Its structure is checked all the same: nothing may lie outside the file,
-and no array may be larger than its stored bytes can make it.
+A file without a seal is refused. So is one whose structure no result has: nothing may lie outside the file, and no
+array may be larger than its stored bytes can make it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import h5py
 
 SEALED = "seal"
-"""Attribute of the root of a sealed file. It tells a file that lost its seal from one of an earlier version."""
+"""Attribute of the root of a sealed file, which says to readers of other programs what its last line is."""
 
 ALGORITHM = "blake2b-256"
 
@@ -146,18 +146,6 @@ def seal(target: Path | io.BytesIO) -> None:
             content.check()
 
 
-def is_sealed(path: str | Path) -> bool:
-    """Return whether a file ends in a seal, right or wrong, without reading the rest of it.
-
-    Raises
-    ------
-    DamagedFile
-        If it is no regular file.
-    """
-    with _regular(path) as file:
-        return _stated(file) is not None
-
-
 @contextlib.contextmanager
 def opened(path: str | Path, *, values: bool = True) -> Iterator[h5py.File]:
     """Verify a file and open it to read.
@@ -168,21 +156,21 @@ def opened(path: str | Path, *, values: bool = True) -> Iterator[h5py.File]:
     ----------
     path : str or Path
     values : bool
-        Whether arrays are read. If only attributes are, the structure of a sealed file is not checked.
+        Whether arrays are read. If only attributes are, the structure is not checked.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     DamagedFile
-        If it is no regular file, its seal is wrong, its structure is not allowed, or anything fails while it is read.
+        If it is no regular file, its seal is missing or wrong, its structure is not allowed, or anything fails while it
+        is read.
     """
     import h5py
 
-    key, sealed = _check_seal(path)
+    key = _check_seal(path)
     with _converted(path), h5py.File(path, "r") as file:
-        _require_seal(file, sealed)
-        if (values or not sealed) and -key not in _known:
+        if values and -key not in _known:
             check_structure(file, os.path.getsize(path))
             _remember(-key)
         yield file
@@ -197,13 +185,13 @@ def glanced(path: str | Path) -> Iterator[h5py.File]:
     FileNotFoundError
         If there is no such file.
     DamagedFile
-        If it is no regular file, it lost its seal, or anything fails while it is read.
+        If it is no regular file, it has no seal, or anything fails while it is read.
     """
     import h5py
 
-    sealed = is_sealed(path)
+    with _regular(path) as content:
+        _require_seal(content, path)
     with _converted(path), h5py.File(path, "r") as file:
-        _require_seal(file, sealed)
         yield file
 
 
@@ -215,14 +203,7 @@ def _converted(path: str | Path) -> Iterator[None]:
     except (FileNotFoundError, InputError):
         raise
     except Exception as error:
-        if "file signature not found" in str(error):
-            raise DamagedFile(path, "it is no HDF5 file") from None
         raise DamagedFile(path, f"{type(error).__name__}: {error}") from None
-
-
-def _require_seal(file: h5py.File, sealed: bool) -> None:
-    if not sealed and SEALED in file.attrs:
-        raise DamagedFile(file.filename, "it lost its seal: it is cut off, or another program changed it")
 
 
 def verify(path: str | Path) -> None:
@@ -255,19 +236,19 @@ def _regular(path: str | Path) -> FileIO:
         raise DamagedFile(path, str(error)) from None
 
 
-def _check_seal(path: str | Path) -> tuple[int, bool]:
-    """Check that the bytes of a file are those of its seal; return the key to remember it, and whether it is sealed."""
+def _check_seal(path: str | Path) -> int:
+    """Check that the bytes of a file are those of its seal; return the key to remember it."""
     with _regular(path) as file:
         status = os.fstat(file.fileno())
         key = _key(path, status)
         try:
-            stated = _stated(file)
-            if key not in _known and stated is not None and _digest(file, status.st_size - _SEAL_BYTES) != stated:
+            stated = _require_seal(file, path)
+            if key not in _known and _digest(file, status.st_size - _SEAL_BYTES) != stated:
                 raise DamagedFile(path, "its bytes are not those that were written: the digest differs")
         except OSError as error:
             raise DamagedFile(path, (error.strerror or str(error)).lower()) from None
     _remember(key)
-    return key, stated is not None
+    return key
 
 
 def _stated(file: Any) -> bytes | None:
@@ -278,6 +259,13 @@ def _stated(file: Any) -> bytes | None:
     file.seek(size - _SEAL_BYTES)
     found = file.read(_SEAL_BYTES)
     return found[len(_MARK) : -1] if found[: len(_MARK)] == _MARK and found[-1:] == b"\n" else None
+
+
+def _require_seal(file: FileIO, path: str | Path) -> bytes:
+    """Return the digest that the seal of a file states; refuse a file without a seal."""
+    if (stated := _stated(file)) is None:
+        raise DamagedFile(path, "it has no seal: it is cut off, or another program wrote or changed it")
+    return stated
 
 
 def _end(file: Any) -> int:
@@ -313,11 +301,6 @@ def _key(path: str | Path, status: os.stat_result) -> int:
         return 0
     times = status.st_mtime_ns, status.st_ctime_ns
     return abs(hash((os.fspath(path), status.st_dev, status.st_ino, status.st_size, *times)))
-
-
-def file_key(path: str | Path) -> int:
-    """Return a number that identifies a file and its content by name, size and times; 0 while they do not."""
-    return _key(path, os.stat(path))
 
 
 def _remember(key: int) -> None:

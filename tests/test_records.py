@@ -111,6 +111,7 @@ FIGURES = PairFigures(
     valid_fraction=0.9,
     finite_fraction=1.0,
     seen_fraction=1.0,
+    measurable_fraction=1.0,
     verdict="most vectors are valid",
     warnings=(WARNING,),
     reconstruction_s=1.0,
@@ -132,10 +133,8 @@ SELF_CALIBRATION = SelfCalibrationFigures(
 FACE = {"axis": 0, "side": 1, "reach_mm": 0.5, "share": 0.1, "guard_mm": 0.4, "farther": False, "limit": "the sight"}
 GUARD = Guard.from_json({"pairs": [0, 1], "faces": [FACE], "layers": [[0, 2], [0, 0], [0, 0]], "short": False})
 REFINEMENT = Refinement(pairs=(0, 1), size_voxel=0.7, factor=1.2, demanded=1.35)
-OLD_FINDING = {"what": "saturated", "camera": "left", "frame": "a", "value": 0.25}
 CASES = {
     "warning": (Warning.from_json, WARNING.to_json()),
-    "finding": (Warning.from_json, OLD_FINDING),
     "pair": (PairFigures.from_json, FIGURES.to_json()),
     "self-calibration": (SelfCalibrationFigures.from_json, SELF_CALIBRATION.to_json()),
     "guard": (Guard.from_json, GUARD.to_json()),
@@ -186,16 +185,17 @@ SUMMARY = {
 @given(changed=mutations(SUMMARY))
 def test_an_earlier_summary_of_any_form_is_used_or_left_out(tmp_path, changed):
     path = tmp_path / "summary.json"
-    path.write_text(json.dumps(SUMMARY))
+    summary_file.write(SUMMARY, path)
     assert summary.read(path).failed == {3: "image missing"} and summary.read(path).weights_s == 2.0
-    path.write_text(json.dumps(changed))
+    digest = {"digest": records.digest(changed)} if isinstance(changed, dict) else {}
+    path.write_text(json.dumps(changed | digest if digest else changed))
     found = summary.read(path)
     assert (isinstance(found.weights, dict) and found.weights_s >= 0) or np.isnan(found.weights_s)
     assert all(isinstance(reason, str) for reason in found.failed.values())
 
 
 def test_a_changed_summary_is_left_out_by_name(tmp_path, caplog):
-    """A digit of a figure, which no form shows; a summary of an earlier version states no digest."""
+    """A digit of a figure, which no form shows."""
     path = tmp_path / "summary.json"
     summary_file.write(SUMMARY, path)
     whole = path.read_text()
@@ -220,12 +220,13 @@ def test_hostile_summaries_and_guards_are_left_out_by_name(tmp_path, text, caplo
 
 
 def test_guard_layers_that_were_changed_are_measured_again(tmp_path, caplog):
-    """The digest is over all entries; a file of an earlier version has none."""
+    """The digest is over all entries."""
     folder = Folder(tmp_path)
     content = {"settings_hash": "01", "depends_on": "{}", "guard": GUARD.to_json()}
     content = json.loads(json.dumps(content))
     folder.guard.write_text(json.dumps(content))
-    assert guard.read(folder)[0] == GUARD
+    assert guard.read(folder) is None
+    caplog.clear()
     sealed = content | {"digest": records.digest(content)}
     folder.guard.write_text(json.dumps(sealed))
     assert guard.read(folder)[0] == GUARD and not caplog.text

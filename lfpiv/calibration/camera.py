@@ -34,11 +34,7 @@ from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
 
 SCHEMA_VERSION = 2
-"""Version of the calibration file. 2: sealed, see `lfpiv.hdf5`."""
-
-SEALED_SINCE = 2
-"""First version whose files are sealed."""
-
+"""Version of the calibration file's form."""
 
 HEAD = ("camera", "pixels (rows, columns)", "microlenses", "mapping", "dots found", "error [pitch]", "warnings")
 """Header of the cameras' rows at a prompt; the error is that of held-out dots, Eq. 8."""
@@ -194,7 +190,7 @@ class Calibration(Shown):
     cameras: dict[str, CalibratedCamera]
     """Cameras by name."""
     board: BoardErrors | None = None
-    """Errors of the board that the calibration corrected. None without a board, and in older files."""
+    """Errors of the board that the calibration corrected. None without a board."""
 
     def card(self) -> Card:
         """Return what matters of the calibration, for people."""
@@ -283,13 +279,10 @@ def _write_camera(group: h5py.Group, camera: CalibratedCamera) -> None:
 
 
 def _require_schema(file: h5py.File, path: Path) -> None:
-    """Refuse a file of another schema, and one without the seal that its schema has."""
+    """Refuse a file of another schema."""
     version = np.ravel(file.attrs.get("schema_version", 0))
-    known = version.size == 1 and version.dtype.kind in "iu" and 1 <= version[0] <= SCHEMA_VERSION
-    if not known:
+    if version.size != 1 or version.dtype.kind not in "iu" or version[0] != SCHEMA_VERSION:
         found = str(file.attrs.get("schema_version"))[:40]
         raise InputError(
-            f"{path}: expected a calibration of schema version 1 to {SCHEMA_VERSION}, found {found}; calibrate again."
+            f"{path}: expected a calibration of schema version {SCHEMA_VERSION}, found {found}; calibrate again."
         )
-    if version[0] >= SEALED_SINCE and not hdf5.is_sealed(path):
-        raise DamagedFile(path, "it has no seal: it is cut off, or another program changed it")

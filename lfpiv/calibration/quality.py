@@ -55,7 +55,7 @@ class CalibrationQuality(LensArrayQuality):
     """Mean error of the mapping on held-out dots, Eq. 8 [microlens pitch]. Errors of the board are corrected."""
     sigma_nor_stated: float = math.nan
     """The same with the dots where they are stated to be: errors of the mapping and of the board together. Equal to
-    `sigma_nor_test` where nothing is corrected; nan in older files."""
+    `sigma_nor_test` where nothing is corrected."""
     dots_found: int
     """Dots measured in all planes."""
     dots_expected: int

@@ -108,7 +108,7 @@ def shown(vectors: xr.Dataset, kinds: dict[str, Quantity]) -> xr.Dataset:
 
 
 def masked_of(vectors: xr.Dataset) -> np.ndarray:
-    """Return which vectors are masked, in the shape of ``u``; files of version 0.1.0 do not have the flag."""
+    """Return which vectors are masked, in the shape of ``u``; none without the flag."""
     if "masked" in vectors:
         return np.asarray(vectors["masked"].values, bool)
     return np.zeros(vectors["u"].shape, bool)

@@ -140,7 +140,7 @@ class AxisDamping(_Figures):
     alike: bool = True
     """False if simulated pairs are harder to measure than recorded ones."""
     raw_error: float | None = None
-    """Expected root mean square error of raw vectors [voxel]; None in older summaries."""
+    """Expected root mean square error of raw vectors [voxel]; None where it is not known."""
     unbiased_error: float | None = None
     """The same of vectors without damping [voxel]."""
 
@@ -161,9 +161,9 @@ class DeviceFigures(_Figures):
     kind: str
     threads: int
     name: str = ""
-    """Empty in older summaries, and where the system does not say it."""
+    """Empty where the system does not say it."""
     memory_bytes: int | None = None
-    """Memory of the GPU [byte]; None on the CPU, and in older summaries."""
+    """Memory of the GPU [byte]; None on the CPU."""
     driver: str = ""
     """Version of CUDA that the GPU's driver knows; empty on the CPU."""
     reason: str = ""

@@ -121,7 +121,7 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
     Returns
     -------
     str
-        A figure, or a paragraph where there is nothing to draw.
+        A figure.
     """
     shown, tables, captions = [], [], []
     if histories:
@@ -129,16 +129,13 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         shown.append(panel)
         tables.append(table)
         captions.append("Part of the images that the projections of the volume do not explain, per iteration of SMART.")
-    if "profile_z" in first:
-        profile = first["profile_z"].isel(frame=0).values
-        sheet = find_sheet(first["z"].values, profile)
-        panel, table = _brightness(first, sheet, [naming.frame(pair, str(frame)) for frame in first["frame"].values])
-        shown.append(panel)
-        tables.append(table)
-        captions.append(f"Mean brightness of the planes along z, {naming.result(pair)}. {_judgement(profile, sheet)}")
-    else:
-        captions.append("The brightness over the depth is not in the file, which an earlier version wrote.")
-    return markup.figure(shown, " ".join(captions), "".join(tables)) if shown else markup.paragraph(captions[0])
+    profile = first["profile_z"].isel(frame=0).values
+    sheet = find_sheet(first["z"].values, profile)
+    panel, table = _brightness(first, sheet, [naming.frame(pair, str(frame)) for frame in first["frame"].values])
+    shown.append(panel)
+    tables.append(table)
+    captions.append(f"Mean brightness of the planes along z, {naming.result(pair)}. {_judgement(profile, sheet)}")
+    return markup.figure(shown, " ".join(captions), "".join(tables))
 
 
 def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:

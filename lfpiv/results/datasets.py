@@ -20,10 +20,7 @@ from lfpiv.files import plain, replacing, write_bytes
 from lfpiv.version import SOURCE, history
 
 SCHEMA_VERSION = 4
-"""Version of the files. 2: the group has its own dimensions. 3: adds ``profile_z``. 4: sealed, and states its name."""
-
-SEALED_SINCE = 4
-"""First version whose files are sealed, see `lfpiv.hdf5`."""
+"""Version of the files' form."""
 
 FILE = "file"
 """Attribute with the name under which a file was written: a copy under another name is recognised by it."""
@@ -135,7 +132,7 @@ def read_group(path: Path, group: str | None = None) -> xr.Dataset:
     Raises
     ------
     InputError
-        If the file is missing, of a newer schema or damaged.
+        If the file is missing, of another schema or damaged.
     """
     import h5netcdf
     from xarray.backends import H5NetCDFStore
@@ -162,12 +159,7 @@ def _check_flags(group: Any, path: Path) -> None:
 
 
 def require_schema(version: Any, path: Path) -> None:
-    """Refuse a file of a newer schema, or of none, and one without the seal that its schema has."""
+    """Refuse a file of another schema, or of none."""
     number = np.ravel(version)
-    whole = int(number[0]) if number.size == 1 and number.dtype.kind in "iu" else 0
-    if not 1 <= whole <= SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: expected schema version 1 to {SCHEMA_VERSION}, found {str(version)[:40]}. Update lfpiv."
-        )
-    if whole >= SEALED_SINCE and not hdf5.is_sealed(path):
-        raise DamagedFile(path, "it has no seal: it is cut off, or another program changed it")
+    if number.size != 1 or number.dtype.kind not in "iu" or number[0] != SCHEMA_VERSION:
+        raise InputError(f"{path}: expected schema version {SCHEMA_VERSION}, found {str(version)[:40]}. Update lfpiv.")

@@ -59,13 +59,12 @@ class ImageState:
         return _digest(self)
 
     def agrees(self, stored: Any) -> bool:
-        """Return whether an entry of a stamp states this image; those of earlier versions have one time, no digest."""
-        if not isinstance(stored, list) or len(stored) not in (3, 5) or stored[0] != self.place:
+        """Return whether an entry of a stamp states this image."""
+        if not isinstance(stored, list) or len(stored) != 5 or stored[0] != self.place:
             return False
-        if stored[:-1] == self.record or stored == self.record[:3]:
+        if stored[:-1] == self.record:
             return True
-        whole = not self.source.part
-        if len(stored) == 3 or (whole and stored[1] != self.size):
+        if not self.source.part and stored[1] != self.size:
             return False
         return bool(stored[-1]) and stored[-1] == self.digest
 

@@ -227,7 +227,7 @@ def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
     Raises
     ------
     InputError
-        If the file is missing, of a newer schema, damaged, or no vector dataset.
+        If the file is missing, of another schema, damaged, or no vector dataset.
     """
     vectors = datasets.read_group(path)
     try:
@@ -268,7 +268,7 @@ def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
     Raises
     ------
     InputError
-        If the file is missing, of a newer schema, damaged, or no volume.
+        If the file is missing, of another schema, damaged, or no volume.
     """
     if grid is not None and path.exists():
         with hdf5.opened(path) as file:

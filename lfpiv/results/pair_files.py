@@ -22,7 +22,7 @@ from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
 from lfpiv.records import read_json, validate
-from lfpiv.results import datasets, finished, netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.particles import write_particles
 from lfpiv.results.provenance import Marks, Stamp
@@ -95,13 +95,9 @@ class VolumeFile:
     grid: Grid | None = None
     """Voxels of the volume; None if the file is not compared with them."""
 
-    def marks(self) -> Marks | None:
-        """Return the marks of the file; None if it is missing or cannot be used."""
-        return finished.volume_marks(self.path, self.grid, self.origin.get("frame"))
-
     def fitting(self) -> Marks | None:
         """Return the marks of the file; None if it is missing or does not fit."""
-        marks = self.marks()
+        marks = provenance.read_marks(self.path)
         return marks if self.stamp.fits(marks) else None
 
     def read(self) -> FrameVolume | None:
@@ -112,7 +108,7 @@ class VolumeFile:
             volume = netcdf.read_volume(self.path, grid=self.grid)
             return FrameVolume(volume=volume, record=_read_record(volume, self.path))
         except InputError as error:
-            finished.refuse(self.path, error)
+            provenance.reject(self.path, error.reason if isinstance(error, DamagedFile) else str(error))
             return None
 
     def write(self, found: FrameVolume) -> None:
@@ -146,8 +142,6 @@ class PairFiles:
     """Volumes of the first and of the second frame."""
     origin: Mapping[str, Any]
     """Attributes that say of what the vectors are: the pair, or instant, step and time."""
-    grid: Grid | None = None
-    """Voxels of the volumes; None if files are not compared with them."""
     particles: Path | None = None
     """Linked particles; None without tracking."""
     particles_stamp: Stamp | None = None
@@ -189,7 +183,6 @@ class PairFiles:
             stamp=stamps.vectors,
             frames=(first, second),
             origin=origin,
-            grid=experiment.grid,
             particles=None if stamps.particles is None else folder.particles(pair),
             particles_stamp=stamps.particles,
         )
@@ -197,7 +190,7 @@ class PairFiles:
     @cached_property
     def vector_marks(self) -> Marks | None:
         """Marks of the vectors, read once; None if they are missing or cannot be used."""
-        return finished.vectors_marks(self.vectors, self.grid)
+        return provenance.read_marks(self.vectors)
 
     def _stamped(self, vectors: bool, volumes: bool, particles: bool = True) -> Iterator[tuple[Stamp, Marks | None]]:
         """Yield the stamp of each file and the marks of the stored one; None if it is missing or cannot be used."""
@@ -206,7 +199,7 @@ class PairFiles:
         if vectors and particles and self.particles is not None and self.particles_stamp is not None:
             yield self.particles_stamp, provenance.read_marks(self.particles)
         if volumes:
-            yield from ((frame.stamp, frame.marks()) for frame in self.frames)
+            yield from ((frame.stamp, provenance.read_marks(frame.path)) for frame in self.frames)
 
     def outdated(self, *, vectors: bool, volumes: bool, particles: bool = True) -> list[str] | None:
         """Return the names of the changed parts of a file's stamp; empty if a file is missing, None if all fit."""

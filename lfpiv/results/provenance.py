@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from lfpiv import files, hdf5, warn
 from lfpiv.errors import DamagedFile
@@ -44,10 +41,6 @@ class Marks:
     """Figures for the summary; None in files without."""
     warnings: tuple[Warning, ...] = ()
     """Warnings about the images it was made from."""
-    frame: str = ""
-    """Frame of a volume, as the experiment names it; empty in other files."""
-    sealed: bool = False
-    """Whether a digest shows that the file is as it was written; files of earlier versions have none."""
 
     @property
     def images(self) -> list[tuple[str, str]]:
@@ -137,13 +130,10 @@ def require_marks(path: Path) -> Marks:
     DamagedFile
         If its bytes are not those that were written, it is a copy of another file, or its marks have another form.
     """
-    names = ("settings_hash", "depends_on", "figures", "warnings", "findings", "frame")
+    names = ("settings_hash", "depends_on", "figures", "warnings")
     with hdf5.opened(path, values=False) as file:
-        sealed = hdf5.SEALED in file.attrs
         found = {name: _text(file.attrs[name], name) for name in names if name in file.attrs}
         require_name(path, file.attrs)
-    if not sealed:
-        _note_unsealed(path.parent)
     try:
         if found.get("depends_on"):
             read_object(found["depends_on"])
@@ -152,8 +142,6 @@ def require_marks(path: Path) -> Marks:
             depends_on=found.get("depends_on", ""),
             figures=read_object(found["figures"]) if "figures" in found else None,
             warnings=stored_warnings(found),
-            frame=found.get("frame", ""),
-            sealed=sealed,
         )
     except RecordError as error:
         raise DamagedFile(path, f"its attributes have another form: {error}") from None
@@ -170,9 +158,6 @@ def _text(value: Any, name: str) -> str:
     return value
 
 
-_PAIR_OF_NAME = re.compile(r"pair_(\d+)(?:_[ab])?\.nc")
-
-
 def require_name(path: Path, attributes: Mapping[str, Any]) -> None:
     """Refuse a file that was written under another name, such as another pair's.
 
@@ -181,29 +166,8 @@ def require_name(path: Path, attributes: Mapping[str, Any]) -> None:
     DamagedFile
         If the attributes of the file name another one.
     """
-    if foreign := _other_name(path, attributes):
-        raise DamagedFile(path, f"it is {foreign} under another name")
-
-
-def _other_name(path: Path, attributes: Mapping[str, Any]) -> str:
-    """Return what a file was written as, if that is not its name; files of earlier versions state a pair only."""
-    named, match = attributes.get("file"), _PAIR_OF_NAME.fullmatch(path.name)
-    if named is not None:
-        return "" if named == path.name else str(named)[:80]
-    pair = attributes.get("pair")
-    if match is None or pair is None:
-        return ""
-    return "" if np.array_equal(np.ravel(pair), [int(match[1])]) else f"pair {str(pair)[:40]}"
-
-
-_noted: set[Path] = set()
-
-
-def _note_unsealed(folder: Path) -> None:
-    """Log once for a folder that its files have no digest."""
-    if folder not in _noted:
-        _noted.add(folder)
-        log.warning("%s: files of an earlier version have no digest; damage to them can be seen only in part", folder)
+    if (named := attributes.get("file", path.name)) != path.name:
+        raise DamagedFile(path, f"it is {str(named)[:80]} under another name")
 
 
 def background_content(path: Path) -> str | None:
@@ -226,11 +190,11 @@ def background_figures(path: Path) -> tuple[Mapping[str, Mapping[str, float | No
 
 
 def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
-    """Read the warnings in the attributes of a file; version 0.1.0 calls them findings.
+    """Read the warnings in the attributes of a file.
 
     Raises
     ------
     RecordError
         If they are no list of warnings.
     """
-    return warn.from_list(read_json(attributes.get("warnings", attributes.get("findings", "[]"))))
+    return warn.from_list(read_json(attributes.get("warnings", "[]")))

@@ -19,7 +19,7 @@ from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, read_object
-from lfpiv.results import datasets, finished, netcdf, provenance, stored_damping
+from lfpiv.results import datasets, netcdf, provenance, stored_damping
 from lfpiv.velocity.damping import ATTRIBUTE
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ class StackedFiles:
             If the file is damaged, or differs from the first one in settings, axes or variables.
         """
         path = self.path(place)
-        finished.require_vectors(path)
+        provenance.require_marks(path)
         with hdf5.opened(path) as file:
             signature = None if self._compared[place] else _signature(file, path)
             found = self._values(file, names)

@@ -22,10 +22,10 @@ class _Stamped:
 
     settings_hash: str
     depends_on: str
-    digest: str = ""
+    digest: str
 
 
-def read(path: Path, parse: Callable[[dict[str, Any]], T], *, sealed: bool = True) -> tuple[T, Marks] | None:
+def read(path: Path, parse: Callable[[dict[str, Any]], T]) -> tuple[T, Marks] | None:
     """Read a stored outcome, whether it fits or not, and its marks; None if the file is missing or damaged.
 
     The log names a damaged file and the reason.
@@ -35,13 +35,11 @@ def read(path: Path, parse: Callable[[dict[str, Any]], T], *, sealed: bool = Tru
     path : Path
     parse : callable
         Takes the content of the file. Raises RecordError if the outcome's entries have another form.
-    sealed : bool
-        Whether a file without a digest is damaged. Files of earlier versions may have none.
     """
     try:
         content = read_object(read_text(path))
         stamped = validate(_Stamped, content)
-        if (sealed or "digest" in content) and stamped.digest != digest(content):
+        if stamped.digest != digest(content):
             raise RecordError("its entries are not those that were written: the digest differs")
         read_object(stamped.depends_on)
         return parse(content), Marks(settings_hash=stamped.settings_hash, depends_on=stamped.depends_on)

@@ -74,7 +74,7 @@ class Guard:
 
 def read(folder: Folder) -> tuple[Guard, Marks] | None:
     """Read the stored outcome, whether it fits or not, and its marks; None if it is missing or damaged."""
-    return stored_outcome.read(folder.guard, lambda content: Guard.from_json(content.get("guard")), sealed=False)
+    return stored_outcome.read(folder.guard, lambda content: Guard.from_json(content.get("guard")))
 
 
 def layers(experiment: Experiment, guard: Guard | None) -> Layers:

@@ -58,6 +58,8 @@ class PairFigures:
     valid_fraction: float
     finite_fraction: float
     seen_fraction: float
+    measurable_fraction: float
+    """Part of the vectors that two cameras see and where there are particles."""
     verdict: str
     warnings: tuple[Warning, ...]
     """Warnings about the images."""
@@ -70,12 +72,10 @@ class PairFigures:
     """Median over the valid vectors."""
     masked_fraction: float = 0.0
     """Part of all vectors that are masked; the other parts are of those that are not."""
-    measurable_fraction: float | None = None
-    """Part of the vectors that two cameras see and where there are particles; None in files that do not state it."""
     unseeded_fraction: float = 0.0
     """Part of the volume that holds no particles."""
     moved_voxel: float | None = None
-    """Median length of the displacements of the valid vectors; None in files that do not state it."""
+    """Median length of the displacements of the valid vectors; None where there are none."""
     flow_voxel: Sequence[float] | None = None
     """Mean displacement of the valid vectors, along x, y, z in each eighth of the volume, 0 where there are none."""
     motion: MotionFigures | None = None
@@ -97,14 +97,11 @@ class PairFigures:
     @property
     def valid_share(self) -> float:
         """Part of the vectors that are valid, of those that can be."""
-        can = self.seen_fraction if self.measurable_fraction is None else self.measurable_fraction
-        return min(self.valid_fraction / can, 1.0) if can > 0 else 0.0
+        return min(self.valid_fraction / self.measurable_fraction, 1.0) if self.measurable_fraction > 0 else 0.0
 
     @property
     def lost_unseeded(self) -> float:
         """Part of the vectors that are not valid because there are no particles."""
-        if self.measurable_fraction is None:
-            return 0.0
         return max(self.seen_fraction - self.measurable_fraction, 0.0)
 
     def unseeded_warning(self, pair: int) -> Warning:
@@ -119,7 +116,7 @@ class PairFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> PairFigures:
-        """Read the form that a file stores; the findings of version 0.1.0 are warnings.
+        """Read the form that a file stores.
 
         Raises
         ------
@@ -128,7 +125,7 @@ class PairFigures:
         """
         if not isinstance(stored, Mapping):
             raise RecordError("expected the figures of a pair")
-        warnings = warn.from_list(stored.get("warnings", stored.get("findings", [])))
+        warnings = warn.from_list(stored.get("warnings", []))
         found = replace(validate(cls, {**stored, "warnings": []}), warnings=warnings)
         shares = (found.valid_fraction, found.finite_fraction, found.seen_fraction, found.masked_fraction)
         if not all(0 <= share <= 1 for share in shares):

@@ -127,7 +127,7 @@ def read(path: Path) -> EarlierSummary:
     """Read an earlier summary; an empty one if the file is missing, damaged or of another schema."""
     try:
         found = read_object(read_text(path))
-        if "digest" in found and found["digest"] != digest(found):  # files of earlier versions state none
+        if found.get("digest") != digest(found):
             raise RecordError("its entries are not those that were written: the digest differs")
         if found.get("schema_version") != SCHEMA_VERSION:
             raise RecordError(

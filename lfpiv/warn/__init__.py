@@ -41,14 +41,6 @@ __all__ = [
 NAMED_PAIRS = 5
 """Largest number of pairs that a sentence names one by one."""
 
-_FINDING_FIGURES = {
-    "misplaced": "gap_light",
-    "saturated": "share",
-    "uneven": "parts",
-    "dim": "structure",
-    "empty": "structure",
-}  # names of the one figure that version 0.1.0 stored with a finding
-
 
 @dataclass(frozen=True, kw_only=True)
 class Warning:
@@ -87,18 +79,14 @@ class Warning:
         return stored | {name: found for name, found in numbers.items() if found}
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any] | str) -> Warning:
-        """Read the form that a file stores; sentences and findings of version 0.1.0 too.
+    def from_json(cls, stored: Mapping[str, Any]) -> Warning:
+        """Read the form that a file stores.
 
         Raises
         ------
         RecordError
-            If it has none of these forms, or its figures do not fit its sentence.
+            If it has another form, or its figures do not fit its sentence.
         """
-        if isinstance(stored, str):
-            return cls(code=Code.OTHER, figures={"text": stored})
-        if isinstance(stored, Mapping) and "what" in stored:
-            return _of_finding(records.validate(_Finding, stored))
         found = records.validate(_Stored, stored)
         numbers = {"pairs": found.pairs, "instants": found.instants}
         if found.code not in {known.value for known in Code}:
@@ -131,26 +119,6 @@ class _Stored:
     figures: Mapping[str, Span | int | float | str | bool | Sequence[int | float | str] | None]
     pairs: tuple[int, ...] = ()
     instants: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Finding:
-    """A warning as files of version 0.1.0 store it."""
-
-    what: str
-    camera: str
-    frame: str
-    value: float
-
-
-def _of_finding(found: _Finding) -> Warning:
-    if found.what not in _FINDING_FIGURES:
-        raise RecordError(f"unknown finding {found.what!r}")
-    figures = {_FINDING_FIGURES[found.what]: found.value}
-    if found.what == Code.UNEVEN.value:
-        figures["ratio"] = 4.0  # the limit of version 0.1.0
-    subject = found.camera + (f", frame {found.frame}" if found.frame else "")
-    return Warning(code=Code(found.what), subject=subject, figures=figures)
 
 
 class _Words(string.Formatter):

@@ -76,7 +76,7 @@ class Code(enum.Enum):
     ONE_GPU = "one_gpu"
     NO_LOCKS = "no_locks"
     OTHER = "other"
-    """A code that this version does not know, or a sentence stored by version 0.1.0."""
+    """A code that this version does not know."""
 
 
 _MISPLACED = (

@@ -77,10 +77,6 @@ def test_figures_leave_masked_vectors_out_and_name_unseeded_ones():
     assert figures.valid_share == pytest.approx(min(figures.valid_fraction / 0.9, 1))
     sentence = figures.unseeded_warning(3).sentence
     assert sentence.startswith("pair 3: 20 % of the volume holds no particles; 10 % of the vectors")
-    old = pair_figures.PairFigures.from_json(
-        {name: value for name, value in figures.to_json().items() if name not in ("measurable_fraction",)}
-    )
-    assert old.lost_unseeded == 0  # files of version 0.1.0 do not tell
 
 
 def test_slices_hatch_masked_cells_only():

@@ -1,11 +1,11 @@
-"""NetCDF files of vectors and volumes: read back as written, older versions read, other forms refused."""
+"""NetCDF files of vectors and volumes: read back as written, other forms refused."""
 
 import json
 
 import numpy as np
 import pytest
 import xarray as xr
-from support.stored import rewrite, unseal
+from support.stored import rewrite
 
 from lfpiv.errors import InputError
 from lfpiv.results import netcdf, provenance
@@ -48,7 +48,7 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
     back = netcdf.read_vectors(path)
     xr.testing.assert_equal(back, written)
     assert back["valid"].dtype == bool and back["w"].attrs["units"] == "m/s"
-    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123", sealed=True)
+    assert provenance.read_marks(path) == provenance.Marks(settings_hash="0123")
     assert json.loads(back.attrs["smart"]) == {"iterations": 2}
     condensed = netcdf.read_reconstruction(path)
     np.testing.assert_array_equal(condensed["projection_y"].values[1], pair["b"].values.max(1))
@@ -69,22 +69,6 @@ def test_flags_that_are_no_flags_are_refused(tmp_path):
     rewrite(path, lambda file: file["valid"].__setitem__(0, 7), sealed=True)
     with pytest.raises(InputError, match="other than 0 and 1"):
         netcdf.read_vectors(path)
-
-
-@pytest.mark.parametrize("version", [1, 2, 3])
-def test_files_of_earlier_versions_are_read(tmp_path, version):
-    """1: the group shares its axes' names with the vectors; 2: no profile over the depth."""
-    path = tmp_path / "pair_0000.nc"
-    reconstruction = netcdf.build_reconstruction({"a": volume(1, [0.9])})
-    netcdf.write_vectors(vectors().assign_attrs(schema_version=version), path, attributes={})
-    older = reconstruction if version == 3 else reconstruction.drop_vars("profile_z")
-    names = {} if version == 1 else {axis: f"voxel_{axis}" for axis in "zyx"}
-    older.assign_attrs(schema_version=version).rename(names).to_netcdf(
-        path, mode="a", group="reconstruction", engine="h5netcdf"
-    )
-    unseal(path)
-    xr.testing.assert_equal(netcdf.read_vectors(path), vectors())
-    xr.testing.assert_equal(netcdf.read_reconstruction(path), older)
 
 
 def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):

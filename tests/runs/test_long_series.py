@@ -100,6 +100,7 @@ def figures(valid):
         valid_fraction=valid,
         finite_fraction=1.0,
         seen_fraction=1.0,
+        measurable_fraction=1.0,
         verdict="good",
         warnings=(Warning(code=Code.DIM, subject="left", figures={"structure": valid}),),
         reconstruction_s=1.0,

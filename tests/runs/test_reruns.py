@@ -81,20 +81,6 @@ def test_exchanged_images_of_one_size_are_noticed(finished):
     assert unfinished(experiment, out) == [0, 3]
 
 
-def test_stamps_of_earlier_versions_are_read(finished):
-    """They state path, size and one time of each image."""
-    experiment, out = finished
-    path = out / "vectors" / "pair_0001.nc"
-    with h5py.File(path, "r+") as file:
-        parts = json.loads(file.attrs["depends_on"])
-        parts["images"] = [entry[:3] for entry in parts["images"]]
-        file.attrs["depends_on"] = json.dumps(parts)
-    hdf5.seal(path)
-    assert unfinished(experiment, out) == []
-    (experiment.parent / "particles" / "left" / "pair_0001_a.tif").touch()
-    assert unfinished(experiment, out) == [1]
-
-
 def arrays(path):
     """Return all arrays of an HDF5 file by their names."""
     found = {}

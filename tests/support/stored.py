@@ -1,4 +1,4 @@
-"""Change stored results as an older version, another program or a mistake would."""
+"""Change stored results as another program or a mistake would."""
 
 import h5py
 import numpy as np
@@ -20,19 +20,6 @@ def rewrite(path, change, *, sealed=False):
         change(file)
     if sealed:
         hdf5.seal(path)
-
-
-def unseal(path, version=None):
-    """Make a file one of an earlier version, which has no seal, no name and an earlier schema."""
-
-    def older(file):
-        for name in (hdf5.SEALED, "file"):
-            if name in file.attrs:
-                del file.attrs[name]
-        if version is not None:
-            file.attrs["schema_version"] = version
-
-    rewrite(path, older)
 
 
 def small_calibration():
