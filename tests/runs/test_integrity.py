@@ -79,9 +79,10 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, ca
     shutil.copy2(volumes / "pair_0000_b.nc", volumes / "pair_0000_a.nc")
     shutil.copy2(volumes / "pair_0002_a.nc", volumes / "pair_0001_a.nc")
     change("intensity", lambda values: 0 * values)(volumes / "pair_0002_b.nc")
+    shutil.copy2(volumes / "pair_0003_b.nc", volumes / "pair_0003_a.nc")
     with pytest.raises(lfpiv.InputError, match="expected the two volumes"):
         pipeline.correlate(small_run.experiment, out)
-    assert rejected(caplog) == [f"pair_000{pair}_{frame}.nc" for pair, frame in ((0, "a"), (1, "a"), (2, "b"))]
+    assert rejected(caplog) == [f"pair_000{pair}_{frame}.nc" for pair, frame in ((0, "a"), (1, "a"), (2, "b"), (3, "a"))]
 
 
 def swap_cameras(path):
