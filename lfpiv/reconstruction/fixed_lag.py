@@ -24,7 +24,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.reconstruction.resting_voxels import without_dark
+from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.sieve import coefficients

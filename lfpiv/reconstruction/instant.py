@@ -10,19 +10,18 @@ from functools import cached_property
 
 import numpy as np
 
+from lfpiv.reconstruction.dark_voxels import DARK
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import Normalisation
 from lfpiv.reconstruction.ordered_subsets import POINT_PASSES, WHOLE_PASSES, Epoch, Partition, Subset, iterate_epochs
 from lfpiv.reconstruction.recording import Recording
-from lfpiv.reconstruction.resting_voxels import DARK, RestingVoxels
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State, iterate
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels.reconstruction.sums import largest
-from lfpiv_kernels.reconstruction.voxels import multiply, part_bright
+from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, duplicate, to_device, to_host
 
 log = logging.getLogger(__name__)
@@ -74,12 +73,8 @@ class PreparedInstant:
             if partitions:
                 if not brief:  # exact, as all steps begin here
                     history.append(self.equations.compare(normalisation.sieve(state.coefficients)))
-                resting = RestingVoxels(self.equations)
-                made = iterate_epochs(
-                    self.equations, state, normalisation.sieve, partitions=partitions, epochs=epochs, resting=resting
-                )
+                made = iterate_epochs(self.equations, state, normalisation.sieve, partitions=partitions, epochs=epochs)
                 state, rose = _run_epochs(made, state, history, progress)
-                resting.wake()
             left = count - history.epochs
             enough = normalisation.is_joint and history.epochs < possible and not rose
             if enough:
@@ -105,8 +100,8 @@ class PreparedInstant:
         """Reconstruct the instant from a first guess that shows already where particles are, by subsets of the rays.
 
         No pass over all rays follows. Misfits are those of the subsets before each step, scaled to the light of all
-        rays. After the last step it is that of `Normalisation.sample`, scaled likewise. No voxel rests. Without a sieve
-        voxels that become dark are left out.
+        rays. After the last step it is that of `Normalisation.sample`, scaled likewise. Without a sieve voxels
+        that become dark are left out.
 
         Parameters
         ----------
@@ -143,9 +138,6 @@ class PreparedInstant:
 
     def _start(self, guess: DeviceArray) -> State:
         """Return the state from which SMART iterates. Overwrites the guess."""
-        if self.settings.active_share > 0:
-            active = part_bright(duplicate(guess), largest(guess), self.settings.active_share)
-            multiply(guess, active, guess)
         return State(guess, Momentum(guess) if self.settings.accelerate else None, self.normalisation.steps)
 
     def _reconstruction(self, volume: DeviceArray, history: History, stop: SmartStop) -> Reconstruction:
@@ -260,9 +252,8 @@ class PreparedInstant:
         progress: Callable[[float], None] | None,
     ) -> tuple[DeviceArray, SmartStop | None]:
         """Iterate over all rays `left` times. Return the last volume, and why it stopped early."""
-        sieve, smooth = self.normalisation.sieve, self.normalisation.smoothing
         done = history.epochs
-        states = iterate(self.equations, state, sieve, iterations=left, smooth=smooth)
+        states = iterate(self.equations, state, self.normalisation.sieve, iterations=left)
         for number, (volume, misfit) in enumerate(states):  # noqa: B007 - the last volume is the result
             history.append(misfit)
             if progress is not None:

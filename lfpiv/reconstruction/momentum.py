@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv_kernels.reconstruction.update import Leap, extrapolate
-from lfpiv_kernels.reconstruction.voxels import replace_resting
-from lfpiv_kernels.transfer import DeviceArray, empty
+from lfpiv_kernels.reconstruction.update import Leap
+from lfpiv_kernels.transfer import DeviceArray
 
 MOMENTUM = 0.9
 """Largest exponent beta: a memory of ten iterations."""
@@ -40,10 +39,6 @@ class Momentum:
         """Exponent beta of the next extrapolation; 0 when the momentum starts."""
         return min((self.time - 1) / self.following_time, self.largest)
 
-    def forget(self, coefficients: DeviceArray, active: DeviceArray) -> None:
-        """Forget the voxels where `active` is 0: their `coefficients` will not change by the momentum."""
-        replace_resting(self.previous, active, coefficients)
-
     def leap(self, ahead: DeviceArray) -> Leap:
         """Return what a step needs to extrapolate its coefficients into `ahead`."""
         return Leap(self.previous, self.exponent, ahead)
@@ -51,12 +46,3 @@ class Momentum:
     def after(self, coefficients: DeviceArray) -> Momentum:
         """Return the momentum after a step to `coefficients`."""
         return Momentum(coefficients, self.following_time, self.largest)
-
-    def extrapolate(self, coefficients: DeviceArray) -> tuple[DeviceArray, Momentum]:
-        """Return extrapolated coefficients after a step, and the momentum after it.
-
-        `coefficients` are lifted in place to the smallest normal float32 where they were not zero before the step.
-        """
-        ahead = empty(coefficients.size)
-        extrapolate(coefficients, self.leap(ahead))
-        return ahead, self.after(coefficients)

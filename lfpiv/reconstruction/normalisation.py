@@ -22,7 +22,7 @@ from lfpiv.reconstruction.ordered_subsets import (
     subsets_of,
 )
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
-from lfpiv.reconstruction.sieve import Sieve, Smoothing
+from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
@@ -129,12 +129,6 @@ class Normalisation:
         plain = SmartStep(size, self.sieve)
         sharpened = self._settings.accelerate and self.sieve.sigma_voxel > 0
         return (SharpenedStep(unblurred, self.sieve), plain) if sharpened else (plain,)
-
-    @cached_property
-    def smoothing(self) -> Smoothing | None:
-        """Blur of the coefficients between iterations; None without any."""
-        width = self._settings.smoothing_voxel
-        return Smoothing(width, self.sieve.shape, self.lit) if width > 0 else None
 
     @cached_property
     def partitions(self) -> tuple[Partition, ...]:

@@ -45,14 +45,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv.reconstruction.dark_voxels import leave_out
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.resting_voxels import RestingVoxels, leave_out
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
 from lfpiv.reconstruction.steps import Step
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.sums import Totals
-from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, duplicate, zeros
 
 log = logging.getLogger(__name__)
@@ -205,7 +204,6 @@ def iterate_epochs(
     *,
     partitions: Sequence[Partition],
     epochs: int,
-    resting: RestingVoxels | None = None,
     left_out: float = 0.0,
     time: float = 1.0,
 ) -> Iterator[Epoch]:
@@ -225,8 +223,6 @@ def iterate_epochs(
         The one to begin with, and those that follow it one by one where subsets conflict.
     epochs : int
         Largest number of epochs.
-    resting : RestingVoxels, optional
-        Lets dark voxels rest. Default: all voxels take part in all epochs.
     left_out : float
         Share of the light in the faintest voxels that are left out for good before each epoch but the first one.
     time : float
@@ -240,26 +236,16 @@ def iterate_epochs(
         steps = partition.safer if safely and partition.safer else partition.steps
         if epoch and left_out > 0:
             leave_out(coefficients, momentum, left_out)
-        active = None if resting is None else resting.active_in(epoch, sieve(coefficients))
-        over = None
-        if active is not None:
-            momentum.forget(coefficients, active)
-            over = steps[0].over(active)
         length = 1 / (1 + SHORTENING * epoch)
         start = duplicate(coefficients)
         agreement = Agreement(start) if partition.conflict > 0 and epoch + 1 < epochs else None
         equations.begin()
         lengths = partition.lengths or (1.0,) * len(steps)
         for subset, step, of_subset in zip(partition.subsets, steps, lengths, strict=True):
-            volume = sieve(coefficients)
-            if active is not None:
-                volume = multiply(volume, active)
-            exponent = equations.exponent_of(subset.parts, volume)
+            exponent = equations.exponent_of(subset.parts, sieve(coefficients))
             if agreement is not None:
                 agreement.add(exponent)
-            coefficients, after = step(
-                coefficients, exponent, momentum, length=length * of_subset, over=over, in_place=True
-            )
+            coefficients, after = step(coefficients, exponent, momentum, length=length * of_subset, in_place=True)
             assert after is not None  # with a momentum there is one after it
             momentum = after
         misfit, count = equations.measured(), len(partition.subsets)

@@ -103,8 +103,6 @@ class Reconstruction:
             "light_outside": list(self.light_outside.values()),
             "normalisation": settings.normalisation,
             "accelerate": int(settings.accelerate),
-            "smoothing_voxel": settings.smoothing_voxel,
             "sieve_voxel": self.sieve_voxel,
-            "active_share": settings.active_share,
         }
         return xr.DataArray(self.volume, dims=AXES, coords=coordinates, name="intensity", attrs=attributes)

@@ -30,11 +30,11 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
+from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.motion import LEAST_VALID
-from lfpiv.reconstruction.resting_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients

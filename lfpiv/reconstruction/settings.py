@@ -35,16 +35,14 @@ class SmartSettings:
     intensity_cap: float | str = DEFAULTS.intensity_cap
     normalisation: str = DEFAULTS.normalisation
     accelerate: bool = DEFAULTS.accelerate
-    smoothing_voxel: float = DEFAULTS.smoothing_voxel
     sieve_voxel: float | str = DEFAULTS.sieve_voxel
-    active_share: float = DEFAULTS.active_share
     tolerance: float = DEFAULTS.tolerance
     subsets: int | str = DEFAULTS.subsets
 
     @property
     def allows_subsets(self) -> bool:
         """Whether the other settings leave ordered subsets possible."""
-        return self.accelerate and self.normalisation == "column" and self.smoothing_voxel == 0
+        return self.accelerate and self.normalisation == "column"
 
     def __post_init__(self) -> None:
         require_whole("iterations", self.iterations)
@@ -52,18 +50,15 @@ class SmartSettings:
             raise ValueError(f"relaxation: expected a number > 0, got {self.relaxation!r}.")
         if self.normalisation not in NORMALISATIONS:
             raise ValueError(f"normalisation: expected one of {', '.join(NORMALISATIONS)}, got {self.normalisation!r}.")
-        if not (is_finite(self.active_share) and 0 <= self.active_share < 1):
-            raise ValueError(f"active_share: expected a number from 0 to below 1, got {self.active_share!r}.")
         if self.subsets != AUTO:
             require_whole("subsets", self.subsets)
             if self.subsets == 0:
                 raise ValueError(f'subsets: expected a whole number >= 1 or "{AUTO}", got 0.')
             if self.subsets != 1 and not self.allows_subsets:
                 raise ValueError(
-                    "subsets: ordered subsets need momentum (`accelerate`), the normalisation by column sums and no "
-                    "smoothing between iterations."
+                    "subsets: ordered subsets need momentum (`accelerate`) and the normalisation by column sums."
                 )
-        for name in ("floor_share", "intensity_cap", "smoothing_voxel", "sieve_voxel", "tolerance"):
+        for name in ("floor_share", "intensity_cap", "sieve_voxel", "tolerance"):
             value, choice = getattr(self, name), f' or "{AUTO}"' if name in ("sieve_voxel", "intensity_cap") else ""
             if choice and isinstance(value, str) and value == AUTO:
                 continue

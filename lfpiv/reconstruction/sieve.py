@@ -1,7 +1,6 @@
-"""Gaussian blurs of SMART's flat volumes: the sieve, and the smoothing between iterations.
+"""The sieve: a Gaussian blur of SMART's flat volumes.
 
-With a sieve G the volume is E = G c, and SMART iterates the coefficients c with W G in place of W [1]_. Smoothing blurs
-the volume itself after an iteration.
+With a sieve G the volume is E = G c, and SMART iterates the coefficients c with W G in place of W [1]_.
 
 .. [1] D. L. Snyder, M. I. Miller, "The use of sieves to stabilize images produced with the EM algorithm for emission
    tomography", IEEE Trans. Nucl. Sci. 32 (1985) 3864-3872, doi:10.1109/TNS.1985.4334521.
@@ -16,12 +15,10 @@ import numpy as np
 
 from lfpiv_kernels.filters.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.voxels import divide, multiply
-from lfpiv_kernels.transfer import DeviceArray, Given, duplicate, to_device, to_host
+from lfpiv_kernels.transfer import Given, duplicate, to_device, to_host
 
 TRUNCATE = 3.5
 """Reach of the sieve's Gaussian [standard deviation]."""
-SMOOTHING_TRUNCATE = 3.0
-"""Reach of the Gaussian that smooths between iterations [standard deviation]."""
 UNBLURRED = 5
 """Steps that undo the sieve's blur of a volume."""
 FAINTEST = 1e-6
@@ -46,27 +43,6 @@ class Sieve:
     @cached_property
     def _blur(self) -> GaussianBlur:
         return GaussianBlur(self.sigma_voxel, self.shape, truncate=TRUNCATE, border="constant")
-
-
-@dataclass(frozen=True)
-class Smoothing:
-    """Gaussian blur of volumes, shape (voxel,), continued constantly outside the volume."""
-
-    sigma_voxel: float
-    """Standard deviation, above 0 [voxel]."""
-    shape: tuple[int, int, int]
-    """Voxel counts in stored order."""
-    lit: DeviceArray
-    """1 for voxels that some camera sees, shape (voxel,), float32. The others stay dark."""
-
-    def __call__(self, volume: DeviceArray) -> DeviceArray:
-        """Return the blurred volume; all on the device."""
-        smoothed = self._blur(volume)
-        return multiply(smoothed, self.lit, smoothed)
-
-    @cached_property
-    def _blur(self) -> GaussianBlur:
-        return GaussianBlur(self.sigma_voxel, self.shape, truncate=SMOOTHING_TRUNCATE, border="nearest")
 
 
 def coefficients(volume: np.ndarray, sieve_voxel: float) -> np.ndarray:

@@ -8,7 +8,7 @@ exponent of a step (`lfpiv.reconstruction.steps`).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
-from lfpiv_kernels.reconstruction.voxels import replace_resting
+from lfpiv_kernels.reconstruction.voxels import darken
 from lfpiv_kernels.transfer import DeviceArray, zeros
 
 
@@ -83,16 +83,6 @@ class ImageEquations:
             self._gather(number, ALL, volume, exponent)
         return self._without_dark(exponent, volume)
 
-    def hold(self, volume: DeviceArray) -> None:
-        """Add the projections of a volume to those of each volume that is compared from now on, until `release`."""
-        for comparison in self.comparisons:
-            comparison.hold(volume)
-
-    def release(self) -> None:
-        """Forget the volumes that are held."""
-        for comparison in self.comparisons:
-            comparison.release()
-
     def begin(self) -> None:
         """Begin to sum the misfits of `compare_part` anew."""
         self._totals.clear()
@@ -120,7 +110,7 @@ class ImageEquations:
     def _without_dark(self, exponent: DeviceArray, volume: DeviceArray) -> DeviceArray:
         """Return an exponent that is 0 where `volume` is 0."""
         if any(camera.projector.takes_rows for camera in self.cameras):
-            replace_resting(exponent, volume)
+            darken(exponent, volume)
         return exponent
 
     def measured(self) -> Misfit:
@@ -139,18 +129,14 @@ class State:
     steps: tuple[Step, ...]
     """Steps, the fastest first. The last one is SMART's own."""
 
-    def proposals(self, exponent: DeviceArray, smooth: Callable[[DeviceArray], DeviceArray] | None) -> Iterator[State]:
+    def proposals(self, exponent: DeviceArray) -> Iterator[State]:
         """Propose the next states, the fastest first: with momentum, without it, and by the steps that remain.
 
         A state without momentum's extrapolation starts the momentum anew. Steps that were passed over are given up.
         """
         for number, step in enumerate(self.steps):
             momentum = self.momentum if number == 0 else None
-            stepped, after = step(self.coefficients, exponent, momentum if smooth is None else None)
-            if smooth is not None:
-                stepped = smooth(stepped)
-                if momentum is not None:
-                    stepped, after = momentum.extrapolate(stepped)
+            stepped, after = step(self.coefficients, exponent, momentum)
             if self.momentum is None:
                 yield State(stepped, None, self.steps[number:])
                 continue
@@ -163,24 +149,18 @@ class State:
 
 
 def iterate(
-    equations: ImageEquations,
-    state: State,
-    sieve: Sieve,
-    *,
-    iterations: int,
-    smooth: Callable[[DeviceArray], DeviceArray] | None = None,
+    equations: ImageEquations, state: State, sieve: Sieve, *, iterations: int
 ) -> Iterator[tuple[DeviceArray, Misfit]]:
     """Iterate SMART; yield the first volume and the one after each iteration, with their misfits.
 
-    An iteration takes the first of its proposals by which the misfit does not rise, or else the last one. `smooth` is
-    applied to the coefficients after each step but those of the last iteration.
+    An iteration takes the first of its proposals by which the misfit does not rise, or else the last one.
     """
     volume = sieve(state.coefficients)
     misfit = equations.compare(volume)
-    for left in reversed(range(iterations)):
+    for _ in range(iterations):
         yield volume, misfit
         exponent = equations.back_project(volume)
-        for proposal in state.proposals(exponent, smooth if left else None):
+        for proposal in state.proposals(exponent):
             volume = sieve(proposal.coefficients)
             proposed = equations.compare(volume)
             if not proposed.divergence > misfit.divergence:

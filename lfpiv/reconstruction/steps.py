@@ -26,7 +26,7 @@ from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv_kernels.filters.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.update import Leap, sharpen, update
-from lfpiv_kernels.reconstruction.voxels import divide, multiply
+from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, empty
 
 SHARPENING = 0.5
@@ -38,18 +38,6 @@ LARGEST_STEP = 3.0
 
 BAND = 0.5
 """Standard deviation of the Gaussian that bounds the details of a sharpened step, as a part of the sieve's."""
-LEAST_ACTIVE = 0.05
-"""Least share of active voxels, weighted by the sharpening's Gaussian, by which a blur of theirs is divided."""
-
-
-@dataclass(frozen=True)
-class Over:
-    """Voxels that take part in a step; arrays have shape (voxel,), float32, on the device."""
-
-    active: DeviceArray
-    """1 for voxels that take part, else 0."""
-    factor: DeviceArray
-    """Factor of a blurred exponent; 0 where `active` is 0."""
 
 
 class Step(Protocol):
@@ -62,7 +50,6 @@ class Step(Protocol):
         momentum: Momentum | None = None,
         *,
         length: float = 1.0,
-        over: Over | None = None,
         in_place: bool = False,
     ) -> tuple[DeviceArray, Momentum | None]:
         """Return the next coefficients and the momentum after them. Zeros stay zero.
@@ -70,20 +57,14 @@ class Step(Protocol):
         Parameters
         ----------
         coefficients, exponent : array
-            Coefficients and the back-projected exponent. With `over` the exponent is 0 for voxels that do not change.
+            Coefficients and the back-projected exponent.
         momentum : Momentum, optional
             Momentum that extrapolates the step.
         length : float
             Factor of the exponent.
-        over : Over, optional
-            What `over` made of the voxels that take part.
         in_place : bool
             Overwrite the coefficients, the exponent and the momentum's memory.
         """
-        ...
-
-    def over(self, active: DeviceArray) -> Over:
-        """Return what a step needs where only voxels whose `active` is 1, and not 0, take part."""
         ...
 
 
@@ -102,18 +83,12 @@ class SmartStep:
         momentum: Momentum | None = None,
         *,
         length: float = 1.0,
-        over: Over | None = None,
         in_place: bool = False,
     ) -> tuple[DeviceArray, Momentum | None]:
         """Return the next coefficients and the momentum after them."""
         stepped, leap = _targets(coefficients, momentum, in_place)
-        factor, blurred = None if over is None else over.factor, self.sieve(exponent)
-        update(coefficients, blurred, self.size, length=length, over=factor, leap=leap, stepped=stepped)
+        update(coefficients, self.sieve(exponent), self.size, length=length, leap=leap, stepped=stepped)
         return _followed(stepped, leap, momentum)
-
-    def over(self, active: DeviceArray) -> Over:
-        """Return the factor 1 for active voxels: light that is blurred into resting voxels does not count."""
-        return Over(active, active)
 
 
 @dataclass(frozen=True)
@@ -131,24 +106,15 @@ class SharpenedStep:
         momentum: Momentum | None = None,
         *,
         length: float = 1.0,
-        over: Over | None = None,
         in_place: bool = False,
     ) -> tuple[DeviceArray, Momentum | None]:
         """Return the next coefficients and the momentum after them."""
         logarithm = multiply(exponent, self.size, exponent if in_place else None, factor=length)
         blurred = self._blur(logarithm)
         logarithm = self._narrow(logarithm)
-        if over is not None:
-            multiply(logarithm, over.active, logarithm)
-        factor = None if over is None else over.factor
         stepped, leap = _targets(coefficients, momentum, in_place)
-        sharpen(coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, over=factor, leap=leap, stepped=stepped)
+        sharpen(coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, leap=leap, stepped=stepped)
         return _followed(stepped, leap, momentum)
-
-    def over(self, active: DeviceArray) -> Over:
-        """Return the factor that makes a blur of active voxels the mean over them."""
-        blurred = self._blur(active)
-        return Over(active, divide(active, blurred, LEAST_ACTIVE, blurred))
 
     @cached_property
     def _blur(self) -> GaussianBlur:

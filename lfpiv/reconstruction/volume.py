@@ -23,9 +23,7 @@ def reconstruct(
     intensity_cap: float | str = DEFAULTS.intensity_cap,
     normalisation: str = DEFAULTS.normalisation,
     accelerate: bool = DEFAULTS.accelerate,
-    smoothing_voxel: float = DEFAULTS.smoothing_voxel,
     sieve_voxel: float | str = DEFAULTS.sieve_voxel,
-    active_share: float = DEFAULTS.active_share,
     tolerance: float = DEFAULTS.tolerance,
     subsets: int | str = DEFAULTS.subsets,
     first: np.ndarray | None = None,
@@ -79,17 +77,11 @@ def reconstruct(
     accelerate : bool
         False iterates without momentum, as in the formulas above. Then, without sieve and tolerance, 5 iterations and 7
         more with the first volume as `first` equal 12 exactly. Momentum starts anew with every call.
-    smoothing_voxel : float
-        Standard deviation [voxel] of a Gaussian that smooths the volume after each iteration but the last; 0 for none.
-        The misfit may rise by it.
     sieve_voxel : float or "auto"
         Standard deviation [voxel] of a sieve: the volume is a sum of Gaussians of this size, E = G c, and SMART
-        iterates their brightnesses c with w G in place of w (`lfpiv.reconstruction.steps`). Other than with smoothing
-        the misfit keeps falling. 0 for none. "auto": matched to the size of the particles, which is measured in the
-        images (`lfpiv.reconstruction.particle_size`); none for particles smaller than voxels.
-    active_share : float
-        Voxels below this share of the first guess's brightest voxel are set to zero at the start and cost no time.
-        0 keeps all.
+        iterates their brightnesses c with w G in place of w (`lfpiv.reconstruction.steps`). 0 for none. "auto": matched
+        to the size of the particles, which is measured in the images (`lfpiv.reconstruction.particle_size`); none for
+        particles smaller than voxels.
     tolerance : float
         Stop when the misfit falls by less than this fraction in an iteration; 0 runs all iterations.
     subsets : int or "auto"
@@ -99,7 +91,7 @@ def reconstruct(
         they contradict each other or have made 128 steps. Otherwise it is a camera or half of its lenses: "auto" takes
         halves of one or two cameras, until they contradict each other, then whole cameras, as for more of them. An
         iteration is a pass over all subsets; the last two iterations, at most half of them, are SMART's own. "auto" is
-        1 without `accelerate`, with smoothing, or with "paper".
+        1 without `accelerate`, or with "paper".
     first : ndarray, shape (z, y, x), optional
         First guess, to continue an iteration or to start from your own; with a sieve, of c. Finite and >= 0. Voxels
         that are zero stay zero and cost no time.
@@ -136,9 +128,7 @@ def reconstruct(
         intensity_cap=intensity_cap,
         normalisation=normalisation,
         accelerate=accelerate,
-        smoothing_voxel=smoothing_voxel,
         sieve_voxel=sieve_voxel,
-        active_share=active_share,
         tolerance=tolerance,
         subsets=subsets,
     )

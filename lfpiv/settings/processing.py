@@ -38,8 +38,6 @@ class Smart(Table):
     """Exponent of Eq. 5: divided by the voxel's column sum, or as printed with weights scaled to a maximum of 1."""
     accelerate: Flag = True
     """Whether Nesterov's momentum in the volume's logarithm reduces the number of iterations to the same limit."""
-    smoothing_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] = 0.0
-    """Standard deviation of a Gaussian smoothing of the volume after each iteration [voxel]; 0 switches it off."""
     floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
     """Lower limit of the noise floor, as a share of the images' brightness; 0 takes the measured noise."""
     intensity_cap: Annotated[float, Field(strict=True, ge=0, le=100)] | Literal["auto"] = "auto"
@@ -52,8 +50,6 @@ class Smart(Table):
     refinement: Annotated[float, Field(strict=True, ge=1, le=bounds.LARGEST_REFINEMENT)] | Literal["auto"] = "auto"
     """Edge of a voxel over that of the voxels that are reconstructed, which the volume is then sampled from; "auto"
     follows from the particles' size in the images, and is 1 where they are large enough."""
-    active_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
-    """Share of the first guess's maximum below which voxels are left out; 0 keeps all."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
     motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
@@ -66,11 +62,11 @@ class Smart(Table):
     def of_one_frame(self, refinement: float = 1.0) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame.
 
-        `refinement` is the edge of a voxel over that of the reconstructed ones, in which lengths are returned.
+        `refinement` is the edge of a voxel over that of the reconstructed ones, in which the sieve is returned.
         """
         settings = self.model_dump(exclude={"motion_passes", "predict", "refinement"})
-        lengths = ("sieve_voxel", "smoothing_voxel")
-        return settings | {name: settings[name] * refinement for name in lengths if settings[name] != "auto"}
+        sieve = settings["sieve_voxel"]
+        return settings | {"sieve_voxel": sieve if sieve == "auto" else sieve * refinement}
 
 
 Displacement = Annotated[float, Field(strict=True, gt=0, le=bounds.LARGEST_DISPLACEMENT_VOXEL)]

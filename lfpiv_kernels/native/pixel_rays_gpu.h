@@ -72,11 +72,10 @@ LFPIV_INLINE void spread_pixels(const Map& map, int warp, const float* image, fl
 }
 
 /// Write the correction of a warp's pixels on their rays, which may lie where their light lies, and sum the misfit of
-/// these pixels. `held` is light that the pixels get besides.
+/// these pixels.
 template <class Map>
-LFPIV_INLINE void compare_pixels(const Map& map, int warp, const float* image, const float* gain, const float* held,
-                                 float floor, const float* rays_in, float* rays_out, double* squares_out,
-                                 double* divergence_out) {
+LFPIV_INLINE void compare_pixels(const Map& map, int warp, const float* image, const float* gain, float floor,
+                                 const float* rays_in, float* rays_out, double* squares_out, double* divergence_out) {
     PerLane<double> squares, divergence;
     for_lanes([&](int lane) { squares[lane] = divergence[lane] = 0.0; });
     for (int64_t first = map.start + (int64_t)warp * LANES_OF_WARP; first < map.end;
@@ -85,7 +84,7 @@ LFPIV_INLINE void compare_pixels(const Map& map, int warp, const float* image, c
             const int k = (int)first + lane;
             if (first + lane >= map.end) return;
             const RaysOfPixel<Map> rays(map, k);
-            const float light = max(held[k] + rays.collect(rays_in), 0.0f);  // interpolation may undershoot
+            const float light = max(rays.collect(rays_in), 0.0f);  // interpolation may undershoot
             const Misfit misfit = compare_pixel(image[k], gain[k], floor, light);
             squares[lane] += (double)misfit.square, divergence[lane] += (double)misfit.divergence;
             rays.spread(misfit.correction, rays_out);

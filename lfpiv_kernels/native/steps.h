@@ -134,36 +134,21 @@ LFPIV_INLINE void store_steps(int run, int size, const float* last, float moment
         for_voxels(run, size, [=](int k) { stepped[k] = light(k); });
 }
 
-/// Step by volume * exp(step * exponent * length). `over` is a factor of the exponent, if there is any.
+/// Step by volume * exp(step * exponent * length).
 LFPIV_INLINE void update(int run, int size, const float* volume, const float* exponent, const float* step, float length,
-                         const float* over, const float* last, float momentum, float* stepped, float* ahead) {
-    if (over)
-        store_steps(run, size, last, momentum, stepped, ahead,
-                    [=](int k) { return times_exponential(volume[k], step[k] * (exponent[k] * length * over[k])); });
-    else
-        store_steps(run, size, last, momentum, stepped, ahead,
-                    [=](int k) { return times_exponential(volume[k], step[k] * (exponent[k] * length)); });
+                         const float* last, float momentum, float* stepped, float* ahead) {
+    store_steps(run, size, last, momentum, stepped, ahead,
+                [=](int k) { return times_exponential(volume[k], step[k] * (exponent[k] * length)); });
 }
 
-/// Step by volume * exp(logarithm + share * (logarithm - blurred)), the absolute exponent at most `largest`. `over` is
-/// a factor of the blurred logarithm, if there is any.
+/// Step by volume * exp(logarithm + share * (logarithm - blurred)), the absolute exponent at most `largest`.
 LFPIV_INLINE void sharpen(int run, int size, const float* volume, const float* logarithm, const float* blurred,
-                          float share, float largest, const float* over, const float* last, float momentum,
-                          float* stepped, float* ahead) {
+                          float share, float largest, const float* last, float momentum, float* stepped, float* ahead) {
     const float most = min(largest, LARGEST_EXPONENT);
-    const auto light = [=](int k, float smooth) {
-        const float step = logarithm[k] + share * (logarithm[k] - smooth);
+    store_steps(run, size, last, momentum, stepped, ahead, [=](int k) {
+        const float step = logarithm[k] + share * (logarithm[k] - blurred[k]);
         return volume[k] * exponential(min(max(step, -most), most));
-    };
-    if (over)
-        store_steps(run, size, last, momentum, stepped, ahead, [=](int k) { return light(k, blurred[k] * over[k]); });
-    else
-        store_steps(run, size, last, momentum, stepped, ahead, [=](int k) { return light(k, blurred[k]); });
-}
-
-/// Let momentum go on from the light of a volume.
-LFPIV_INLINE void extrapolate(int run, int size, const float* last, float exponent, float* volume, float* ahead) {
-    store_steps(run, size, last, exponent, volume, ahead, [=](int k) { return volume[k]; });
+    });
 }
 
 }  // namespace lfpiv

@@ -41,14 +41,14 @@ LFPIV_INLINE Misfit compare_pixel(float counts, float gain, float floor, float p
 }
 
 /// Write the correction of a run's pixels on their rays, which may lie where their light lies, and sum the misfit of
-/// these pixels. `held` is light that the pixels get besides.
-LFPIV_INLINE void compare(const PixelRun& run, const float* image, const float* gain, const float* held, float floor,
-                          const float* rays, float* rays_out, double* squares_out, double* divergence_out) {
+/// these pixels.
+LFPIV_INLINE void compare(const PixelRun& run, const float* image, const float* gain, float floor, const float* rays,
+                          float* rays_out, double* squares_out, double* divergence_out) {
     double squares = 0.0, divergence = 0.0;
     run.for_pixels([&](int start, int count) {
         float model[PixelRun::GROUP], square[PixelRun::GROUP], term[PixelRun::GROUP];
         for (int k = 0; k < count; ++k)
-            model[k] = max(held[start + k] + run.collect(rays, start + k), 0.0f);  // interpolation may undershoot
+            model[k] = max(run.collect(rays, start + k), 0.0f);  // interpolation may undershoot
         for (int k = 0; k < count; ++k) {
             const Misfit misfit = compare_pixel(image[start + k], gain[start + k], floor, model[k]);
             model[k] = misfit.correction, square[k] = misfit.square, term[k] = misfit.divergence;

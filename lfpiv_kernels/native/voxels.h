@@ -49,12 +49,9 @@ LFPIV_INLINE void add_masked(int run, int size, const float* added, const float*
         for_voxels(run, size, [=](int k) { out[k] = out[k] + added[k]; });
 }
 
-/// Overwrite a volume by `values`, or by 0 if that is null, where `active` is 0.
-LFPIV_INLINE void replace(int run, int size, const float* active, const float* values, float* out) {
-    if (values)
-        for_voxels(run, size, [=](int k) { out[k] = active[k] == 0.0f ? values[k] : out[k]; });
-    else
-        for_voxels(run, size, [=](int k) { out[k] = active[k] == 0.0f ? 0.0f : out[k]; });
+/// Overwrite a volume by 0 where another one is 0.
+LFPIV_INLINE void darken(int run, int size, const float* volume, float* out) {
+    for_voxels(run, size, [=](int k) { out[k] = volume[k] == 0.0f ? 0.0f : out[k]; });
 }
 
 /// Write 1 for voxels with light of at least `least`, else 0; leave the others' light in `light`.

@@ -27,7 +27,7 @@ def _spread_pixels(map: PixelRays, warp: int, image: wp.array(dtype=float), rays
 
 
 @wp.func_native("""
-    lfpiv::compare_pixels(map, warp, image.data, gain.data, held.data, floor, rays.data, rays_out.data,
+    lfpiv::compare_pixels(map, warp, image.data, gain.data, floor, rays.data, rays_out.data,
                           squares_out.data, divergence_out.data);
 """)
 def _compare_pixels(
@@ -35,7 +35,6 @@ def _compare_pixels(
     warp: int,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
-    held: wp.array(dtype=float),
     floor: float,
     rays: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
@@ -76,7 +75,6 @@ def _compare(
     map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
-    held: wp.array(dtype=float),
     floor: float,
     rays: wp.array(dtype=float),
     first_warp: int,
@@ -86,7 +84,7 @@ def _compare(
     divergence_out: wp.array(dtype=wp.float64),
 ):
     warp, _lane = wp.tid()
-    _compare_pixels(map, first_warp + warp, image, gain, held, floor, rays, rays_out, squares_out, divergence_out)
+    _compare_pixels(map, first_warp + warp, image, gain, floor, rays, rays_out, squares_out, divergence_out)
 
 
 def collect(map: PixelRays, rays: wp.array, image_out: wp.array) -> None:

@@ -148,7 +148,7 @@ class Projector(RayProjector):
     def __init__(self, blocks: Blocks, planes: PlaneShares | None = None, limit_bytes: int | None = None):
         super().__init__()
         self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
-        self.planes, self.rests = planes, planes is None
+        self.planes = planes
         """How voxels are shared among the nodes whose weights `blocks` are; None if these are the voxels."""
         self._planes = None if planes is None else DepthPlanes(planes)
         self._on_cpu = runtime.device().form == "cpu"

@@ -158,7 +158,6 @@ class SeparableProjector(RayProjector):
         Number of sets of rays.
     """
 
-    rests = False
     takes_rows = True
 
     def __init__(self, weights: SeparableWeights, sets: int):

@@ -38,8 +38,6 @@ class RayProjector:
 
     takes_rows = False
     """Whether sets of rays are rows of pixels under every lens, each of which sees the whole volume."""
-    rests: bool
-    """Whether dark voxels cost no time."""
     form: str
     """Form of the weights, "profiles" or "pixels"."""
     nbytes: int

@@ -11,8 +11,8 @@ from lfpiv_kernels.reconstruction import pixel_rays_gpu
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, PixelRays
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
-from lfpiv_kernels.reconstruction.voxels import FEWEST_VOXELS, sweep_runs
-from lfpiv_kernels.transfer import Values, empty, to_device, zeros
+from lfpiv_kernels.reconstruction.voxels import sweep_runs
+from lfpiv_kernels.transfer import Values, empty, to_device
 
 wp.set_module_options(native.options("update.h"))
 
@@ -30,7 +30,7 @@ SMALLEST: float = native.constant("steps.h", "SMALLEST")
 
 @wp.func_native("""
     lfpiv::compare(
-        lfpiv::pixel_run(map, run), image.data, gain.data, held.data, floor, rays.data, rays_out.data,
+        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays.data, rays_out.data,
         squares_out.data, divergence_out.data
     );
 """)
@@ -39,7 +39,6 @@ def _compare_run(
     map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
-    held: wp.array(dtype=float),
     floor: float,
     rays: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
@@ -54,7 +53,6 @@ def _compare(
     map: PixelRays,
     image: wp.array(dtype=float),
     gain: wp.array(dtype=float),
-    held: wp.array(dtype=float),
     floor: float,
     rays: wp.array(dtype=float),
     first_run: int,
@@ -63,12 +61,12 @@ def _compare(
     squares_out: wp.array(dtype=wp.float64),  # per run
     divergence_out: wp.array(dtype=wp.float64),
 ):
-    _compare_run(first_run + wp.tid(), map, image, gain, held, floor, rays, rays_out, squares_out, divergence_out)
+    _compare_run(first_run + wp.tid(), map, image, gain, floor, rays, rays_out, squares_out, divergence_out)
 
 
 @wp.func_native("""
     lfpiv::update(
-        run, size, volume.data, exponent.data, step.data, length, over.data, last.data, momentum, stepped_out.data,
+        run, size, volume.data, exponent.data, step.data, length, last.data, momentum, stepped_out.data,
         ahead_out.data
     );
 """)
@@ -79,7 +77,6 @@ def _update_run(
     exponent: wp.array(dtype=float),
     step: wp.array(dtype=float),
     length: float,
-    over: wp.array(dtype=float),
     last: wp.array(dtype=float),
     momentum: float,
     stepped_out: wp.array(dtype=float),
@@ -94,7 +91,6 @@ def _update(
     exponent: wp.array(dtype=float),
     step: wp.array(dtype=float),
     length: float,
-    over: wp.array(dtype=float),  # times which the exponent counts, if there is any
     last: wp.array(dtype=float),
     momentum: float,
     size: int,
@@ -104,12 +100,12 @@ def _update(
     ahead_out: wp.array(dtype=float),
 ):
     run = first_run + wp.tid()
-    _update_run(run, size, volume, exponent, step, length, over, last, momentum, stepped_out, ahead_out)
+    _update_run(run, size, volume, exponent, step, length, last, momentum, stepped_out, ahead_out)
 
 
 @wp.func_native("""
     lfpiv::sharpen(
-        run, size, volume.data, logarithm.data, blurred.data, share, largest, over.data, last.data, momentum,
+        run, size, volume.data, logarithm.data, blurred.data, share, largest, last.data, momentum,
         stepped_out.data, ahead_out.data
     );
 """)
@@ -121,7 +117,6 @@ def _sharpen_run(
     blurred: wp.array(dtype=float),
     share: float,
     largest: float,
-    over: wp.array(dtype=float),
     last: wp.array(dtype=float),
     momentum: float,
     stepped_out: wp.array(dtype=float),
@@ -137,7 +132,6 @@ def _sharpen(
     blurred: wp.array(dtype=float),
     share: float,
     largest: float,
-    over: wp.array(dtype=float),  # times which the blurred logarithm counts, if there is any
     last: wp.array(dtype=float),
     momentum: float,
     size: int,
@@ -147,45 +141,7 @@ def _sharpen(
     ahead_out: wp.array(dtype=float),
 ):
     run = first_run + wp.tid()
-    _sharpen_run(run, size, volume, logarithm, blurred, share, largest, over, last, momentum, stepped_out, ahead_out)
-
-
-@wp.func_native("lfpiv::extrapolate(run, size, last.data, exponent, volume_out.data, ahead_out.data);")
-def _extrapolate_run(
-    run: int,
-    size: int,
-    last: wp.array(dtype=float),
-    exponent: float,
-    volume_out: wp.array(dtype=float),
-    ahead_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
-def _extrapolate(
-    # in
-    last: wp.array(dtype=float),
-    exponent: float,
-    size: int,
-    first_run: int,
-    # out
-    volume_out: wp.array(dtype=float),
-    ahead_out: wp.array(dtype=float),
-):
-    _extrapolate_run(first_run + wp.tid(), size, last, exponent, volume_out, ahead_out)
-
-
-@wp.kernel
-def _hold(
-    # in
-    pixel: wp.array(dtype=int),
-    image: wp.array(dtype=float),
-    first_pixel: int,
-    # out
-    held_out: wp.array(dtype=float),
-):
-    k = first_pixel + wp.tid()
-    held_out[k] = held_out[k] + image[pixel[k]]
+    _sharpen_run(run, size, volume, logarithm, blurred, share, largest, last, momentum, stepped_out, ahead_out)
 
 
 @dataclass(frozen=True)
@@ -232,7 +188,6 @@ class Comparison:
         """Their gains."""
         self.size = len(image)
         """Pixels of the sensor."""
-        self._held = zeros(len(pixel))
         parts = pixel_rays_gpu.WARPS if runtime.device().form == "gpu" else projector.map.rays.runs
         self._sums = [empty(parts, wp.float64) for _ in range(2)]
 
@@ -240,18 +195,6 @@ class Comparison:
         """Return the counts of the pixels that see one set of rays only, or of all for ``ALL``, shape (pixel,)."""
         rays = self.projector.map.of(ray_set)
         return self._counts[rays.start : rays.end]
-
-    def hold(self, volume: wp.array) -> None:
-        """Add the projection of `volume` to that of each volume that is compared from now on. Overwrites the rays."""
-        self.projector.scatter(volume)
-        image = empty(self.size)
-        self.projector.map.collect(self.projector.rays, image)
-        call = Call(_hold, self._held.size, [self.projector.map.rays.pixel, image], [self._held])
-        launch(call, parts=parts_of(self._held.size, FEWEST_VOXELS))
-
-    def release(self) -> None:
-        """Forget the volumes that are held."""
-        self._held.zero_()
 
     def compare(self, volume: Values, totals: Totals, ray_set: int = ALL) -> None:
         """Project `volume`, shape (voxel,), and write gain * log((image + floor) / (projection + floor)) on the rays.
@@ -266,7 +209,7 @@ class Comparison:
         projector.scatter(volume, ray_set)
         projector.darken(ray_set)
         rays = projector.map.of(ray_set)
-        inputs = [rays, self.image, self.gain, self._held, self.floor, projector.rays]
+        inputs = [rays, self.image, self.gain, self.floor, projector.rays]
         outputs = [projector.returned, *self._sums]
         if runtime.device().form == "gpu":
             size = pixel_rays_gpu.compare(inputs, outputs)
@@ -283,7 +226,6 @@ def update(
     step: wp.array,
     *,
     length: float = 1.0,
-    over: wp.array | None = None,
     leap: Leap | None = None,
     stepped: wp.array,
 ) -> None:
@@ -295,15 +237,13 @@ def update(
         On the device.
     length : float
         Factor of all exponents.
-    over : array, optional
-        Factor of each exponent.
     leap : Leap, optional
         Momentum that goes on from the step.
     stepped : array
         Where to write. It may be any of the other arrays.
     """
     last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
-    sweep_runs(_update, [volume, exponent, step, float(length), over, last, float(momentum)], [stepped, ahead])
+    sweep_runs(_update, [volume, exponent, step, float(length), last, float(momentum)], [stepped, ahead])
 
 
 def sharpen(
@@ -313,19 +253,13 @@ def sharpen(
     share: float,
     largest: float,
     *,
-    over: wp.array | None = None,
     leap: Leap | None = None,
     stepped: wp.array,
 ) -> None:
-    """Write volume * exp(logarithm + share * (logarithm - over * blurred)) to `stepped`; float32, shape (voxel,).
+    """Write volume * exp(logarithm + share * (logarithm - blurred)) to `stepped`; float32, shape (voxel,).
 
     The absolute exponent is at most `largest`, and at most `LARGEST_EXPONENT`. The other arguments are as of `update`.
     """
     last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
-    inputs = [volume, logarithm, blurred, float(share), float(largest), over, last, float(momentum)]
+    inputs = [volume, logarithm, blurred, float(share), float(largest), last, float(momentum)]
     sweep_runs(_sharpen, inputs, [stepped, ahead])
-
-
-def extrapolate(volume: wp.array, leap: Leap) -> None:
-    """Let momentum go on from `volume` as it is after a step. Lifts its numbers as `Leap` says."""
-    sweep_runs(_extrapolate, [leap.last, float(leap.exponent)], [volume, leap.ahead])

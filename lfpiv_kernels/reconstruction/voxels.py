@@ -111,35 +111,27 @@ def _add(
     _add_run(first_run + wp.tid(), size, added, mask, volume_out)
 
 
-@wp.func_native("lfpiv::replace(run, size, active.data, values.data, volume_out.data);")
-def _replace_run(
-    run: int,
-    size: int,
-    active: wp.array(dtype=float),
-    values: wp.array(dtype=float),
-    volume_out: wp.array(dtype=float),
-): ...
+@wp.func_native("lfpiv::darken(run, size, volume.data, darkened_out.data);")
+def _darken_run(run: int, size: int, volume: wp.array(dtype=float), darkened_out: wp.array(dtype=float)): ...
 
 
 @wp.kernel
-def _replace(
+def _darken(
     # in
-    active: wp.array(dtype=float),
-    values: wp.array(dtype=float),
+    volume: wp.array(dtype=float),
     size: int,
     first_run: int,
     # out
-    volume_out: wp.array(dtype=float),
+    darkened_out: wp.array(dtype=float),
 ):
-    _replace_run(first_run + wp.tid(), size, active, values, volume_out)
+    _darken_run(first_run + wp.tid(), size, volume, darkened_out)
 
 
-@wp.func_native("lfpiv::part(run, size, share * least.data[0], light_out.data, active_out.data);")
+@wp.func_native("lfpiv::part(run, size, least.data[0], light_out.data, active_out.data);")
 def _part_run(
     run: int,
     size: int,
     least: wp.array(dtype=float),
-    share: float,
     light_out: wp.array(dtype=float),
     active_out: wp.array(dtype=float),
 ): ...
@@ -149,14 +141,13 @@ def _part_run(
 def _part(
     # in
     least: wp.array(dtype=float),
-    share: float,
     size: int,
     first_run: int,
     # out
     light_out: wp.array(dtype=float),
     active_out: wp.array(dtype=float),
 ):
-    _part_run(first_run + wp.tid(), size, least, share, light_out, active_out)
+    _part_run(first_run + wp.tid(), size, least, light_out, active_out)
 
 
 def multiply(one: wp.array, other: wp.array, out: wp.array | None = None, *, factor: float = 1.0) -> wp.array:
@@ -185,15 +176,15 @@ def add(added: wp.array, out: wp.array, mask: wp.array | None = None) -> None:
     sweep_runs(_add, [added, mask], [out])
 
 
-def replace_resting(out: wp.array, active: wp.array, values: wp.array | None = None) -> None:
-    """Overwrite `out` by `values` where `active` is 0. Default: by 0."""
-    sweep_runs(_replace, [active, values], [out])
+def darken(out: wp.array, volume: wp.array) -> None:
+    """Overwrite `out` by 0 where `volume` is 0."""
+    sweep_runs(_darken, [volume], [out])
 
 
-def part_bright(light: wp.array, least: wp.array, share: float = 1.0) -> wp.array:
-    """Return 1 for voxels with light of at least share * `least`, shape (1,), else 0. Leave the others' in `light`."""
+def part_bright(light: wp.array, least: wp.array) -> wp.array:
+    """Return 1 for voxels with light of at least `least`, shape (1,), else 0. Leave the others' in `light`."""
     active = empty(light.size)
-    sweep_runs(_part, [least, float(share)], [light, active])
+    sweep_runs(_part, [least], [light, active])
     return active
 
 

@@ -87,7 +87,6 @@ OWN = {
     "ten_iterations": Choice(label="10 SMART iterations", smart={"iterations": 10}),
     "no_sieve": Choice(label="no sieve: voxels of any brightness", smart={"sieve_voxel": 0.0}),
     "motion_pass": Choice(label="one motion pass: both frames at once", smart={"motion_passes": 1}, both_frames=True),
-    "smoothed_smart": Choice(label="volume smoothed by 0.5 voxel in every iteration", smart={"smoothing_voxel": 0.5}),
     "unsmoothed": Choice(
         label="no sieve, and volumes correlated unsmoothed",
         smart={"sieve_voxel": 0.0},

@@ -100,8 +100,8 @@ def test_lengths_in_voxels_and_flags_are_those_of_the_new_voxels():
     values = ndimage.gaussian_filter(rng.random(fine.shape), 1.0)
     nearest = fine.nearest_in(GRID)
     given = volume_of(fine, values, masked=solid[nearest], views=views[nearest], unshared=2 * values)
-    found = volume_on(given.assign_attrs(sieve_voxel=0.75, smoothing_voxel=0.5, stop="done"), GRID)
-    assert found.attrs["sieve_voxel"] == pytest.approx(0.6) and found.attrs["smoothing_voxel"] == pytest.approx(0.4)
+    found = volume_on(given.assign_attrs(sieve_voxel=0.75, stop="done"), GRID)
+    assert found.attrs["sieve_voxel"] == pytest.approx(0.6)
     assert found.attrs["voxel_mm"] == GRID.voxel_mm and found.attrs["stop"] == "done"
     assert found.attrs["reconstruction_voxel_mm"] == pytest.approx(0.08)
     np.testing.assert_array_equal(found.coords["masked"], solid)

@@ -40,10 +40,9 @@ def test_sweeps_are_the_operators_of_numpy(volumes):
         total = duplicate(on[0])
         voxels.add(on[3], total, mask)
         np.testing.assert_array_equal(to_host(total), expected)
-    for values, expected in ((on[3], signed), (None, 0)):
-        replaced = duplicate(on[0])
-        voxels.replace_resting(replaced, on[2], values)
-        np.testing.assert_array_equal(to_host(replaced), np.where(lit > 0, positive, expected))
+    darkened = duplicate(on[0])
+    voxels.darken(darkened, on[2])
+    np.testing.assert_array_equal(to_host(darkened), np.where(lit > 0, positive, 0))
 
 
 def test_a_sweep_may_overwrite_what_it_reads(volumes):
@@ -55,10 +54,10 @@ def test_a_sweep_may_overwrite_what_it_reads(volumes):
 
 def test_voxels_are_parted_at_a_threshold_that_stays_on_the_device(volumes):
     positive, dark, _, _ = volumes
-    light, largest = to_device(dark.copy()), sums.largest(to_device(positive))
-    assert to_host(largest)[0] == positive.max()
-    active = to_host(voxels.part_bright(light, largest, 0.01))
-    bright = (dark >= np.float32(0.01) * positive.max()) & (dark > 0)
+    assert to_host(sums.largest(to_device(positive)))[0] == positive.max()
+    light, least = to_device(dark.copy()), np.float32(0.01) * positive.max()
+    active = to_host(voxels.part_bright(light, to_device(np.array([least]))))
+    bright = (dark >= least) & (dark > 0)
     np.testing.assert_array_equal(active, bright)
     np.testing.assert_array_equal(to_host(light), np.where(bright, 0, dark))
 
@@ -104,22 +103,20 @@ def test_sums_do_not_depend_on_the_threads(monkeypatch):
     assert found[0] == found[1] == found[2]
 
 
-@pytest.mark.parametrize("over", [False, True])
 @pytest.mark.parametrize("momentum", [False, True])
 @pytest.mark.parametrize("in_place", [False, True])
-def test_steps_with_momentum_equal_their_twin(volumes, over, momentum, in_place):
-    positive, dark, lit, signed = volumes
+def test_steps_with_momentum_equal_their_twin(volumes, momentum, in_place):
+    positive, dark, _, signed = volumes
     last = np.where(dark > 0, positive * 1.1, 0).astype(np.float32)
     share, largest, beta, length = 0.5, 3.0, 0.8, 0.9
-    factor = lit.astype(float) if over else 1.0
-    smart = dark * np.exp(0.3 * signed.astype(float) * length * factor)
+    smart = dark * np.exp(0.3 * signed.astype(float) * length)
     logarithm = signed.astype(float)
-    sharp = dark * np.exp(np.clip(logarithm + share * (logarithm - 0.5 * logarithm * factor), -largest, largest))
+    sharp = dark * np.exp(np.clip(logarithm + share * (logarithm - 0.5 * logarithm), -largest, largest))
     for expected, is_sharp in ((smart, False), (sharp, True)):
         volume, memory = to_device(dark.copy()), to_device(last.copy())
         stepped = memory if in_place and momentum else volume if in_place else empty(dark.size)
         leap = update.Leap(memory, beta, volume if in_place else empty(dark.size)) if momentum else None
-        keywords = {"over": to_device(lit) if over else None, "leap": leap, "stepped": stepped}
+        keywords = {"leap": leap, "stepped": stepped}
         if is_sharp:
             update.sharpen(volume, to_device(signed), to_device(0.5 * signed), share, largest, **keywords)
         else:
@@ -199,7 +196,8 @@ def test_momentum_of_all_ratios(exponent):
         power = repeated ** np.clip(exponent, -update.LARGEST_MOMENTUM, update.LARGEST_MOMENTUM)
         expected = np.where(last > 0, np.maximum(lifted * power, FLOAT32.tiny), last)
     volume, leap = to_device(light.copy()), update.Leap(to_device(last), exponent, empty(last.size))
-    update.extrapolate(volume, leap)
+    nothing = zeros(last.size)
+    update.update(volume, nothing, nothing, leap=leap, stepped=volume)
     np.testing.assert_array_equal(to_host(volume), lifted)
     assert_light(leap.ahead, expected, TOLERANCE_POWER * max(1, min(abs(exponent), update.LARGEST_MOMENTUM)))
     np.testing.assert_array_equal(to_host(leap.ahead)[last <= 0], last[last <= 0])

@@ -44,7 +44,6 @@ EVERY_PASS = {
     ("sums_gpu", "_sum_values"),
     ("uncertainty_gpu", "_sum_differences"),
     ("uncertainty_gpu", "_sum_products"),
-    ("update", "_extrapolate"),
     ("update", "_sharpen"),
     ("update", "_update"),
     ("windows_gpu", "_sum_columns"),

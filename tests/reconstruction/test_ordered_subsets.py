@@ -316,7 +316,6 @@ def test_subsets_do_not_depend_on_the_threads(volume_of_blobs, monkeypatch, subs
         ({"subsets": 2}, 2, 2),
         ({"subsets": 1}, 2, 1),
         ({"subsets": "auto", "accelerate": False}, 2, 1),
-        ({"subsets": "auto", "smoothing_voxel": 1.0}, 2, 1),
         ({"subsets": "auto", "normalisation": "paper"}, 2, 1),
     ],
 )

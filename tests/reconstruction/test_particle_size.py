@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from support import plain_steps
 from support.ideal_rig import optics, two_cameras
+from support.noisy_blobs import noisy_blobs
 
 import lfpiv
+from lfpiv.reconstruction import solver
 from lfpiv.reconstruction.particle_size import SIEVE_STEP_VOXEL, ParticleSizer
 
 TOLERANCE_SIZE = 0.08  # [voxel] some hundred particles: a tenth of their covariance, a twentieth of its root
@@ -82,3 +84,13 @@ def test_faces_at_which_particles_end_do_not_enlarge_them():
         at = np.random.default_rng(seed).uniform(-0.5, 0.5, (300, 3)) * size_mm
         found.append(sizer.size(sizer.fluctuations(traced_images(rig, at, 0.093, seed, counts=200.0, rays=2000))))
     assert np.mean(found) == pytest.approx(np.sqrt(0.93**2 - 1 / 12), abs=TOLERANCE_SIZE)
+
+
+def test_solvers_of_the_same_weights_share_the_estimator(monkeypatch):
+    weights, _, images = noisy_blobs(40)
+    monkeypatch.setattr(weights, "derived", {})
+    made = []
+    monkeypatch.setattr(solver, "ParticleSizer", lambda weights: made.append(weights) or ParticleSizer(weights))
+    for _ in range(2):
+        lfpiv.reconstruct(weights, images, 1, sieve_voxel="auto")
+    assert len(made) == 1

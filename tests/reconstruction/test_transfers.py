@@ -10,7 +10,6 @@ from support.ideal_rig import optics, two_cameras
 from support.noisy_blobs import noisy_blobs
 
 import lfpiv
-from lfpiv.reconstruction import resting_voxels
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
@@ -25,9 +24,7 @@ CASES = {
     "subsets": {"subsets": 4},
     "subsets that may grow": {"subsets": "auto"},
     "without sieve": {"subsets": 1, "sieve_voxel": 0.0},
-    "smoothing": {"subsets": 1, "smoothing_voxel": 0.5},
     "the paper's steps": {"subsets": 1, "sieve_voxel": 0.0, "accelerate": False, "normalisation": "paper"},
-    "active share": {"subsets": 4, "active_share": 1e-3},
 }
 VOLUMES = {1: 10, 4: 10.5}
 """Volumes that a reconstruction may allocate at once, by the number of subsets; the constants of the rig are older.
@@ -50,12 +47,6 @@ def recorded(request, device):
 @pytest.fixture
 def moves(device):
     return runtime.device().form == "gpu"
-
-
-@pytest.fixture(autouse=True)
-def voxels_rest(monkeypatch):
-    """Let voxels of a small volume rest."""
-    monkeypatch.setattr(resting_voxels, "FEWEST_VOXELS", 0)
 
 
 def solver_of(recorded, iterations, settings):
@@ -123,7 +114,6 @@ def test_a_step_over_a_subset_launches_few_sweeps_and_reuses_its_memory(recorded
     prepared.solve(iterations=0)
     monkeypatch.setattr(wp, "launch", counted)
     counts = []
-    monkeypatch.setattr(resting_voxels, "ALL", 10)  # none rests
     for epochs in (2, 6):
         launched.clear()
         prepared.solve(iterations=epochs, whole_passes=0)
@@ -132,15 +122,14 @@ def test_a_step_over_a_subset_launches_few_sweeps_and_reuses_its_memory(recorded
     each = {name: (counts[1][name] - counts[0][name]) / steps for name in ("_multiply", "_sharpen", "_blur")}
     blurs = each.pop("_blur")
     assert each == {"_multiply": 1, "_sharpen": 1} and blurs <= 2 * runtime.CHUNKS
-    assert counts[1]["_replace"] - counts[0]["_replace"] == (steps if recorded[0].has_ray_rows else 0)
-    assert not {"_update", "_extrapolate"} & set(counts[1])
+    assert counts[1]["_darken"] - counts[0]["_darken"] == (steps if recorded[0].has_ray_rows else 0)
+    assert "_update" not in counts[1]
 
 
 @pytest.mark.parametrize("subsets", VOLUMES)
-def test_passes_allocate_few_volumes_and_no_more_with_their_number(subsets, moves, monkeypatch):
+def test_passes_allocate_few_volumes_and_no_more_with_their_number(subsets, moves):
     if moves:
         pytest.skip("memory of a device is not traced")
-    monkeypatch.setattr(resting_voxels, "ALL", 10)  # none rests: sorting the light takes memory, too
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.4,) * 3, voxel_mm=0.08)
     weights = lfpiv.build_weights(two_cameras(optics=optics(rows=300, columns=300)), grid, form="profiles")
     images = weights(np.random.default_rng(0).random(grid.shape, np.float32))

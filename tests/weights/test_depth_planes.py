@@ -8,8 +8,6 @@ from scipy import ndimage
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv.reconstruction.resting_voxels import RestingVoxels
-from lfpiv.reconstruction.smart import CameraEquation, ImageEquations
 from lfpiv.weights import depth_planes, separable
 from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.depth_planes import (
@@ -29,7 +27,6 @@ from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
-from lfpiv_kernels.transfer import to_device
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
 TOLERANCE_ADJOINT = 1e-5  # as of the operator
@@ -263,23 +260,6 @@ def test_stored_weights_keep_their_nodes(weights, tmp_path, request):
     volume = np.random.default_rng(6).random(GRID.shape).astype(np.float32)
     for (name, image), again in zip(nodes(volume).items(), opened(volume).values(), strict=True):
         np.testing.assert_array_equal(again, image, err_msg=name)
-
-
-def test_no_voxel_rests_where_nodes_share_the_weights(both, monkeypatch):
-    monkeypatch.setattr("lfpiv.reconstruction.resting_voxels.FEWEST_VOXELS", 0)
-    volume = np.random.default_rng(7).lognormal(0, 3, GRID.size).astype(np.float32)
-    rested = []
-    for weights in both:
-        equations = ImageEquations(
-            [
-                CameraEquation(image=gain, gain=gain, floor=1.0, projector=weights.projector(name))
-                for name, gain in ((name, weights.gain(name)) for name in weights.cameras)
-            ]
-        )
-        with equations.locked():
-            resting = RestingVoxels(equations)
-            rested.append(any(resting.active_in(epoch, to_device(volume)) is not None for epoch in range(6)))
-    assert rested == [False, True]
 
 
 @pytest.mark.slow
