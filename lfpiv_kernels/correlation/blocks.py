@@ -19,27 +19,16 @@ from lfpiv_kernels.launch import Call, launch
 wp.set_module_options(native.options("blocks.h", contract="fast"))
 
 
-@wp.func_native("lfpiv::split_plane(volume.data, shape, lattice, plane, split_out.data);")
-def _split_plane(
-    volume: wp.array(dtype=float),
-    shape: wp.vec3i,
-    lattice: Lattice,
-    plane: int,
-    split_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::split_plane(volume.data, shape, lattice, plane, split_out.data);")
 def _split(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x)
     shape: wp.vec3i,
     lattice: Lattice,  # may reach beyond the volume, where values are 0
-    begin: int,
+    first_plane: int,
     # out
     split_out: wp.array(dtype=float),  # (plane, phase y, phase x, lane)
-):
-    _split_plane(volume, shape, lattice, begin + wp.tid(), split_out)
+): ...
 
 
 def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) -> Call:
@@ -50,23 +39,13 @@ def split_call(volume: wp.array, plan: Plan, lattice: Lattice, split: wp.array) 
     return Call(_split, lattice.planes, inputs, [split])
 
 
-@wp.func_native("""
+@native.kernel("""
 #if !LFPIV_GPU
-    lfpiv::correlate_blocks(first, second, layers, task, scratch_out.data + scratch, sum_out.data);
+    lfpiv::correlate_blocks(
+        first, second, layers, task, scratch_out.data + (int64_t)slot * scratch_pitch, sum_out.data
+    );
 #endif
 """)
-def _correlate_group(
-    first: Phased,
-    second: Phased,
-    layers: Layers,
-    task: int,
-    scratch: wp.int64,
-    scratch_out: wp.array(dtype=float),
-    sum_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _correlate_blocks(
     # in
     first: Phased,  # blocks of the first volume
@@ -74,33 +53,24 @@ def _correlate_blocks(
     layers: Layers,
     scratch_pitch: int,  # elements of scratch memory per slot
     slot: int,
-    begin: int,
+    first_task: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
-):
-    scratch = wp.int64(slot) * wp.int64(scratch_pitch)
-    _correlate_group(first, second, layers, begin + wp.tid(), scratch, scratch_out, sum_out)
-
-
-@wp.func_native("lfpiv::gather_blocks(layers, blocks_y, blocks_x, pitch, task, sum_out.data);")
-def _gather_lag(
-    layers: Layers, blocks_y: int, blocks_x: int, pitch: int, task: int, sum_out: wp.array(dtype=float)
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::gather_blocks(layers, blocks_y, blocks_x, pitch, task, sum_out.data);")
 def _gather_blocks(
     # in
     blocks_y: int,  # blocks per window along y and x
     blocks_x: int,
     pitch: int,  # lanes per row of blocks
     layers: Layers,
-    begin: int,
+    first_task: int,
     # out
     sum_out: wp.array(dtype=float),  # (layer, lag, lane): before, sums over blocks; after, over a window's y and x
-):
-    _gather_lag(layers, blocks_y, blocks_x, pitch, begin + wp.tid(), sum_out)
+): ...
 
 
 def is_gathered(plan: Plan) -> bool:

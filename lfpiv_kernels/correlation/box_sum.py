@@ -18,23 +18,11 @@ PART = 512
 """Sums that a CPU task forms."""
 
 
-@wp.func_native("""
+@native.kernel("""
     const int64_t begin = (int64_t)task * part;
     const int count = size - begin < part ? size - begin : part;
     lfpiv::sum_terms(source.data + begin, distance, terms, count, sum_out.data + begin);
 """)
-def _sum_part(
-    source: wp.array(dtype=float),
-    distance: int,
-    terms: int,
-    size: wp.int64,
-    part: int,
-    task: int,
-    sum_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _box_sum(
     # in
     source: wp.array(dtype=float),  # flat volume, and padding that the last sums read
@@ -42,11 +30,10 @@ def _box_sum(
     terms: int,
     size: wp.int64,  # sums
     part: int,  # sums per thread
-    begin: int,
+    first_task: int,
     # out
     sum_out: wp.array(dtype=float),
-):
-    _sum_part(source, distance, terms, size, part, begin + wp.tid(), sum_out)
+): ...
 
 
 def box_sum(volume: Values, window: Triple, keep: tuple[slice, ...] | None = None) -> Values:

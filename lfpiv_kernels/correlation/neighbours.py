@@ -41,24 +41,11 @@ class Prediction:
     """Number of neighbours, shape (vector,)."""
 
 
-@wp.func_native("""
+@native.kernel("""
     const int64_t first = (int64_t)task * group;
     lfpiv::predict_points(field.data, keep.data, points.data + first, shape, points.shape[0] - first,
         prediction_out.data + 18 * first, count_out.data + first);
 """)
-def _predict_group(
-    field: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    points: wp.array(dtype=int),
-    shape: wp.vec3i,
-    group: int,
-    task: int,
-    prediction_out: wp.array(dtype=float),
-    count_out: wp.array(dtype=int),
-): ...
-
-
-@wp.kernel
 def _predict(
     # in
     field: wp.array(dtype=float),  # flat, (z, y, x, component)
@@ -66,12 +53,11 @@ def _predict(
     points: wp.array(dtype=int),  # linear index of the vectors wanted
     shape: wp.vec3i,  # of the grid
     group: int,  # vectors per task
-    first_group: int,
+    first_task: int,
     # out
     prediction_out: wp.array(dtype=float),  # flat, (vector, component, 6): as in `Prediction`
     count_out: wp.array(dtype=int),  # neighbours, (vector,)
-):
-    _predict_group(field, keep, points, shape, group, first_group + wp.tid(), prediction_out, count_out)
+): ...
 
 
 def predict(field: Values, keep: np.ndarray, wanted: np.ndarray) -> Prediction:

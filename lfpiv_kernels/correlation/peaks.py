@@ -27,20 +27,7 @@ SCORE_BYTES = 1 << 23
 """Memory for the coefficients of a CPU task [byte]."""
 
 
-@wp.func_native("lfpiv::find_peaks(sums, first, second, windows, slot, task, scratch_out.data, peak_out.data);")
-def _find_peaks_of_group(
-    sums: Sums,
-    first: Statistics,
-    second: Statistics,
-    windows: Windows,
-    slot: int,
-    task: int,
-    scratch_out: wp.array(dtype=float),
-    peak_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::find_peaks(sums, first, second, windows, slot, task, scratch_out.data, peak_out.data);")
 def _find_peaks(
     # in
     sums: Sums,
@@ -48,12 +35,11 @@ def _find_peaks(
     second: Statistics,  # at every lag
     windows: Windows,
     slot: int,
-    begin: int,
+    first_task: int,
     # out
     scratch_out: wp.array(dtype=float),
     peak_out: wp.array(dtype=float),  # two displacements (z, y, x), best and rival coefficient; each (layer, lane)
-):
-    _find_peaks_of_group(sums, first, second, windows, slot, begin + wp.tid(), scratch_out, peak_out)
+): ...
 
 
 @dataclass(frozen=True)

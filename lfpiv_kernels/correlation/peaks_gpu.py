@@ -31,17 +31,6 @@ def _score(
 ): ...
 
 
-@wp.func_native(
-    "lfpiv::find_peaks_of_window(windows, task, score.data, peak_out.data + (int64_t)windows.begin * windows.lanes);"
-)
-def _find(
-    windows: Windows,
-    score: wp.array(dtype=float),
-    task: int,
-    peak_out: wp.array(dtype=float),
-): ...
-
-
 @wp.kernel(cuda_max_registers=64)
 def _score_windows(
     # in
@@ -58,17 +47,23 @@ def _score_windows(
     _score(sums, first, second, windows, count, begin + task, score_out)
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::find_peaks_of_window(
+        windows, task, score.data, peak_out.data + (int64_t)windows.begin * windows.lanes
+    );
+    """,
+    "task",
+    "_lane",
+)
 def _find_window_peaks(
     # in
     windows: Windows,  # a warp per window
     score: wp.array(dtype=float),
-    begin: int,
+    first_task: int,
     # out
     peak_out: wp.array(dtype=float),  # as in ``peaks._find_peaks``
-):
-    task, _lane = wp.tid()
-    _find(windows, score, begin + task, peak_out)
+): ...
 
 
 def score_pitch(lags: tuple[int, int, int]) -> int:

@@ -13,27 +13,12 @@ PART = 1 << 10
 """Elements of a plane that a task transforms: its scratch memory fits a core's own cache."""
 
 
-@wp.func_native("""
+@native.kernel("""
 #if !LFPIV_GPU
     const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
     lfpiv::transform_planes(volume, transform, first_plane, stride, part, task, scratch, plane_out.data);
 #endif
 """)
-def _transform_part(
-    volume: Phased,
-    transform: PlaneTransform,
-    first_plane: int,
-    stride: int,
-    part: int,
-    task: int,
-    slot: int,
-    scratch_pitch: wp.int64,
-    scratch_out: wp.array(dtype=float),
-    plane_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _transform_planes(
     # in
     volume: Phased,
@@ -43,13 +28,11 @@ def _transform_planes(
     part: int,  # elements per thread, a multiple of `LANES`
     scratch_pitch: wp.int64,  # elements of scratch memory per slot
     slot: int,
-    begin: int,
+    first_task: int,
     # out
     scratch_out: wp.array(dtype=float),
     plane_out: wp.array(dtype=float),  # (layer, row, element)
-):
-    task = begin + wp.tid()
-    _transform_part(volume, transform, first_plane, stride, part, task, slot, scratch_pitch, scratch_out, plane_out)
+): ...
 
 
 def transform_call(

@@ -20,27 +20,12 @@ from lfpiv_kernels.launch import Call, launch
 wp.set_module_options(native.options("spectra.h", contract="fast"))
 
 
-@wp.func_native("""
+@native.kernel("""
 #if !LFPIV_GPU
     const auto scratch = scratch_out.data + (int64_t)slot * scratch_pitch;
     lfpiv::correlate_spectra(first, second, transform, layers, past, task, scratch, sum_out.data);
 #endif
 """)
-def _correlate_group(
-    first: Phased,
-    second: Phased,
-    transform: Transform,
-    layers: Layers,
-    past: int,
-    task: int,
-    slot: int,
-    scratch_pitch: wp.int64,
-    scratch_out: wp.array(dtype=float),
-    sum_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _correlate_spectra(
     # in
     first: Phased,  # spectra of layers of blocks, (layer, row, element), see `planes`
@@ -50,13 +35,11 @@ def _correlate_spectra(
     past: int,  # lanes behind a group's last whose voxels it reaches
     scratch_pitch: wp.int64,  # elements of scratch memory per slot
     slot: int,
-    begin: int,
+    first_task: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
-):
-    task = begin + wp.tid()
-    _correlate_group(first, second, transform, layers, past, task, slot, scratch_pitch, scratch_out, sum_out)
+): ...
 
 
 @dataclass(frozen=True)

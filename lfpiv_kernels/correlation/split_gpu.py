@@ -10,29 +10,25 @@ from lfpiv_kernels.launch import Call
 wp.set_module_options(native.options("split_gpu.h"))
 
 
-@wp.func_native("lfpiv::split_lanes(volume.data, shape, lattice, plane, task, split_out.data);")
-def _split_lanes(
-    volume: wp.array(dtype=float),
-    shape: wp.vec3i,
-    lattice: Lattice,
-    plane: int,
-    task: int,
-    split_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::split_lanes(
+        volume.data, shape, lattice, plane, task, split_out.data
+    );
+    """,
+    "plane",
+    "task",
+    "_lane",
+)
 def _split_voxels(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x); a warp per plane, phase along y and 32 lanes
     shape: wp.vec3i,
     lattice: Lattice,
-    begin: int,
+    first_plane: int,
     # out
     split_out: wp.array(dtype=float),
-):
-    plane, task, _lane = wp.tid()
-    _split_lanes(volume, shape, lattice, begin + plane, task, split_out)
+): ...
 
 
 def split_call(inputs: list[object], lattice: Lattice, split: wp.array) -> Call:

@@ -21,22 +21,12 @@ SIGNAL_FLOOR = 1e-4
 """Lowest variance of a window that holds signal, as a share of the whole volume's variance."""
 
 
-@wp.func_native(
-    "lfpiv::sum_plane(volume.data, extent, lattice, z, scratch_out.data + scratch, sum_out.data, square_out.data);"
-)
-def _sum_plane(
-    volume: wp.array(dtype=float),
-    extent: Extent,
-    lattice: Lattice,
-    z: int,
-    scratch: wp.int64,
-    scratch_out: wp.array(dtype=float),
-    sum_out: wp.array(dtype=float),
-    square_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel("""
+    lfpiv::sum_plane(
+        volume.data, extent, lattice, z, scratch_out.data + (int64_t)slot * scratch_pitch, sum_out.data,
+        square_out.data
+    );
+""")
 def _sum_planes(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x)
@@ -44,30 +34,19 @@ def _sum_planes(
     lattice: Lattice,  # windows wanted, counted from the first that fits
     scratch_pitch: wp.int64,
     slot: int,  # scratch memory to use
-    begin: int,
+    first_z: int,
     # out
     scratch_out: wp.array(dtype=float),
     sum_out: wp.array(dtype=float),  # sums over the windows' y and x, (z, y, x) with as many y and x as windows fit
     square_out: wp.array(dtype=float),  # the same of the squares
-):
-    scratch = wp.int64(slot) * scratch_pitch
-    _sum_plane(volume, extent, lattice, begin + wp.tid(), scratch, scratch_out, sum_out, square_out)
-
-
-@wp.func_native("lfpiv::measure_row(sum.data, square.data, extent, floor, lattice, y, mean_out.data, scale_out.data);")
-def _measure_row(
-    sum: wp.array(dtype=float),
-    square: wp.array(dtype=float),
-    extent: Extent,
-    floor: float,
-    lattice: Lattice,
-    y: int,
-    mean_out: wp.array(dtype=float),
-    scale_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::measure_row(
+        sum.data, square.data, extent, floor, lattice, y, mean_out.data, scale_out.data
+    );
+""")
 def _window_statistics(
     # in
     sum: wp.array(dtype=float),  # of `_sum_planes`
@@ -75,12 +54,11 @@ def _window_statistics(
     extent: Extent,
     floor: float,  # sum of squared deviations up to which a window holds no signal
     lattice: Lattice,  # windows wanted, counted from the first that fits
-    begin: int,
+    first_y: int,
     # out
     mean_out: wp.array(dtype=float),  # stored by phase
     scale_out: wp.array(dtype=float),  # the same
-):
-    _measure_row(sum, square, extent, floor, lattice, begin + wp.tid(), mean_out, scale_out)
+): ...
 
 
 def _extent(plan: Plan, search: Triple) -> Extent:

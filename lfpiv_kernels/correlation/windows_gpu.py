@@ -11,80 +11,50 @@ from lfpiv_kernels.launch import Call
 wp.set_module_options(native.options("windows_gpu.h"))
 
 
-@wp.func_native("lfpiv::sum_row(volume.data, extent, row, x, sum_out.data, square_out.data);")
-def _sum_row(
-    volume: wp.array(dtype=float),
-    extent: Extent,
-    row: int,
-    x: int,
-    sum_out: wp.array(dtype=float),
-    square_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::sum_row(volume.data, extent, row, x, sum_out.data, square_out.data);", "row", "x")
 def _sum_rows(
     # in
     volume: wp.array(dtype=float),  # flat, (z, y, x); a thread per row of a plane and window along x
     extent: Extent,
-    begin: int,
+    first_row: int,
     # out
     sum_out: wp.array(dtype=float),  # sums over the windows' x, (z, y, x) with as many x as windows fit
     square_out: wp.array(dtype=float),  # the same of the squares
-):
-    row, x = wp.tid()
-    _sum_row(volume, extent, begin + row, x, sum_out, square_out)
-
-
-@wp.func_native(
-    "lfpiv::sum_column(row_sum.data, row_square.data, extent, lattice, z, y, x, sum_out.data, square_out.data);"
-)
-def _sum_column(
-    row_sum: wp.array(dtype=float),
-    row_square: wp.array(dtype=float),
-    extent: Extent,
-    lattice: Lattice,
-    z: int,
-    y: int,
-    x: int,
-    sum_out: wp.array(dtype=float),
-    square_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::sum_column(
+        row_sum.data, row_square.data, extent, lattice, z, y, x, sum_out.data, square_out.data
+    );
+    """,
+    "z",
+    "y",
+    "x",
+)
 def _sum_columns(
     # in
     row_sum: wp.array(dtype=float),  # of `_sum_rows`; a thread per plane, and window along y and x
     row_square: wp.array(dtype=float),
     extent: Extent,
     lattice: Lattice,
-    begin: int,
+    first_z: int,
     # out
     sum_out: wp.array(dtype=float),  # sums over the windows' y and x, as many y and x as windows fit
     square_out: wp.array(dtype=float),
-):
-    z, y, x = wp.tid()
-    _sum_column(row_sum, row_square, extent, lattice, begin + z, y, x, sum_out, square_out)
-
-
-@wp.func_native(
-    "lfpiv::measure_column(sum.data, square.data, extent, floor, lattice, y, x, mean_out.data, scale_out.data);"
-)
-def _measure_column(
-    sum: wp.array(dtype=float),
-    square: wp.array(dtype=float),
-    extent: Extent,
-    floor: float,
-    lattice: Lattice,
-    y: int,
-    x: int,
-    mean_out: wp.array(dtype=float),
-    scale_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::measure_column(
+        sum.data, square.data, extent, floor, lattice, y, x, mean_out.data, scale_out.data
+    );
+    """,
+    "y",
+    "x",
+)
 def _window_statistics(
     # in
     sum: wp.array(dtype=float),  # of `_sum_columns`; a thread per row and column
@@ -92,13 +62,11 @@ def _window_statistics(
     extent: Extent,
     floor: float,
     lattice: Lattice,
-    begin: int,
+    first_y: int,
     # out
     mean_out: wp.array(dtype=float),  # (plane, y, x) with as many y and x as windows fit
     scale_out: wp.array(dtype=float),  # the same
-):
-    y, x = wp.tid()
-    _measure_column(sum, square, extent, floor, lattice, begin + y, x, mean_out, scale_out)
+): ...
 
 
 def sums_calls(

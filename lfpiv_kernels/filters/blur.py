@@ -25,28 +25,13 @@ FEWEST_VOXELS = 8192
 """Smallest part of a launch: a smaller one takes less time than the launch itself."""
 
 
-@wp.func_native("""
+@native.kernel("""
     const lfpiv::AxisBlur along = lfpiv::axis_blur(middle);
     const int64_t area = (int64_t)along.size * length;
     const lfpiv::RowBlur inner{row.data, (int)row.shape[0], nearest};
     lfpiv::blur_plane(lfpiv::axis_blur(outer), along, inner, length, plane, volume.data,
                       work_out.data + (int64_t)slot * work_out.shape[1], blurred_out.data + plane * area);
 """)
-def _blur_plane(
-    outer: Axis,
-    middle: Axis,
-    row: wp.array(dtype=float),
-    nearest: bool,
-    length: int,
-    plane: int,
-    slot: int,
-    volume: wp.array(dtype=float),
-    work_out: wp.array2d(dtype=float),
-    blurred_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _blur(
     # in
     outer: Axis,
@@ -60,8 +45,7 @@ def _blur(
     # out
     work_out: wp.array2d(dtype=float),
     blurred_out: wp.array(dtype=float),
-):
-    _blur_plane(outer, middle, row, nearest, length, first_plane + wp.tid(), slot, volume, work_out, blurred_out)
+): ...
 
 
 class Blur:

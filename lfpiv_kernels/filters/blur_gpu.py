@@ -12,13 +12,15 @@ from lfpiv_kernels.launch import Call, launch
 wp.set_module_options(native.options("blur_gpu.h", contract="fast"))
 
 
-@wp.func_native("lfpiv::blur_lanes(lfpiv::axis_blur(axis), stride, warp, size, volume.data, blurred_out.data);")
-def _blur_lanes(
-    axis: Axis, stride: int, warp: int, size: int, volume: wp.array(dtype=float), blurred_out: wp.array(dtype=float)
-): ...
-
-
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::blur_lanes(
+        lfpiv::axis_blur(axis), stride, warp, volume.shape[0], volume.data, blurred_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _blur_axis(
     # in
     axis: Axis,
@@ -27,9 +29,7 @@ def _blur_axis(
     first_warp: int,
     # out
     blurred_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _blur_lanes(axis, stride, first_warp + warp, volume.shape[0], volume, blurred_out)
+): ...
 
 
 def blur(axes: Sequence[Axis], volume: wp.array, work_out: wp.array, blurred_out: wp.array) -> None:

@@ -1,11 +1,16 @@
 """C++ headers of the Warp kernels, stored in this folder, and the options that compile a module with them.
 
-A kernel module names its header in ``wp.set_module_options(native.options("projector.h"))``; its ``wp.func_native``
-functions then call the header's functions in one line. Constants that C++ and Python share are written in the header.
+A kernel module names its header in ``wp.set_module_options(native.options("projector.h"))``. Its kernels then call the
+header's functions in one line each, by `kernel` or ``wp.func_native``. Constants that C++ and Python share are written
+in the header.
 """
 
+import ast
+import inspect
+import linecache
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import warp as wp
@@ -51,6 +56,44 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0, gpu: b
     }
     flags = f"-ffp-contract={contract} {QUIET}" if contract else QUIET
     return chosen | quiet_options(flags)
+
+
+def kernel(call: str, *threads: str) -> Callable[[Callable[..., None]], wp.Kernel]:
+    """Declare a kernel each of whose threads makes one call of a function of the header.
+
+    The decorated function has the kernel's arguments and no body. In the call they have their own names. The last one
+    below ``# in`` is where a part of a launch begins, and says what a thread's number is: ``first_run`` makes it `run`.
+
+    Parameters
+    ----------
+    call : str
+        The call in C++, such as ``lfpiv::multiply(run, size, one.data, factor, other.data, product_out.data);``.
+    *threads : str
+        Names of the thread's numbers along the axes of a launch of several; one with "_" in front is not in the call.
+    """
+
+    def declare(function: Callable[..., None]) -> wp.Kernel:
+        name, names = function.__name__, function.__globals__
+        text = inspect.getsource(function)
+        arguments = ast.parse(text).body[0].args.args  # type: ignore[attr-defined]
+        first = [one.arg for one in arguments if not one.arg.endswith("_out")][-1]
+        axes = threads or (first.removeprefix("first_"),)
+        used = [one for one in axes if not one.startswith("_")]
+        given = [one for one in arguments if one.arg != first]
+        stub = ", ".join([f"{one}: int" for one in used] + [ast.unparse(one) for one in given])
+        passed = ", ".join([f"{first} + {used[0]}", *used[1:], *(one.arg for one in given)])
+        source = (
+            f"@wp.func_native({call!r})\ndef {name}_call({stub}): ...\n\n\n"
+            f"@wp.kernel\ndef {name}({', '.join(map(ast.unparse, arguments))}):\n"
+            f"    {', '.join(axes)} = wp.tid()\n    {name}_call({passed})\n"
+        )
+        place = f"<kernel {function.__module__}.{name}>"
+        linecache.cache[place] = len(source), None, source.splitlines(keepends=True), place  # Warp reads its source
+        exec(compile(source, place, "exec"), names)
+        declared: wp.Kernel = names[name]
+        return declared
+
+    return declare
 
 
 def quiet_options(flags: str = QUIET) -> dict[str, object]:

@@ -68,17 +68,7 @@ class PlaneShares:
         return node[share != 0], share[share != 0]
 
 
-@wp.func_native("lfpiv::spread_row(lfpiv::plane_map(map), row, absolute, voxels.data, nodes_out.data);")
-def _spread_row(
-    map: PlaneMap, row: int, absolute: bool, voxels: wp.array(dtype=float), nodes_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("lfpiv::collect_row(lfpiv::plane_map(map), row, nodes.data, voxels_out.data);")
-def _collect_row(map: PlaneMap, row: int, nodes: wp.array(dtype=float), voxels_out: wp.array(dtype=float)): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::spread_row(lfpiv::plane_map(map), row, absolute, voxels.data, nodes_out.data);")
 def _spread(
     # in
     map: PlaneMap,
@@ -87,11 +77,10 @@ def _spread(
     first_row: int,
     # out
     nodes_out: wp.array(dtype=float),
-):
-    _spread_row(map, first_row + wp.tid(), absolute, voxels, nodes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::collect_row(lfpiv::plane_map(map), row, nodes.data, voxels_out.data);")
 def _collect(
     # in
     map: PlaneMap,
@@ -99,8 +88,7 @@ def _collect(
     first_row: int,
     # out
     voxels_out: wp.array(dtype=float),
-):
-    _collect_row(map, first_row + wp.tid(), nodes, voxels_out)
+): ...
 
 
 class DepthPlanes:

@@ -13,24 +13,15 @@ wp.set_module_options(native.options("depth_planes_gpu.h", contract="fast"))
 TAPS: int = native.constant("depth_planes.h", "TAPS")
 
 
-@wp.func_native("""
-    lfpiv::spread_nodes(lfpiv::plane_map(map), layers_of.data, warp, absolute, voxels.data, nodes_out.data);
-""")
-def _spread_nodes(
-    map: PlaneMap,
-    layers_of: wp.array(dtype=int),
-    warp: int,
-    absolute: bool,
-    voxels: wp.array(dtype=float),
-    nodes_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("lfpiv::collect_voxels(lfpiv::plane_map(map), warp, nodes.data, voxels_out.data);")
-def _collect_voxels(map: PlaneMap, warp: int, nodes: wp.array(dtype=float), voxels_out: wp.array(dtype=float)): ...
-
-
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::spread_nodes(
+        lfpiv::plane_map(map), layers_of.data, warp, absolute, voxels.data, nodes_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _spread(
     # in
     map: PlaneMap,
@@ -40,12 +31,10 @@ def _spread(
     first_warp: int,
     # out
     nodes_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _spread_nodes(map, layers_of, first_warp + warp, absolute, voxels, nodes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::collect_voxels(lfpiv::plane_map(map), warp, nodes.data, voxels_out.data);", "warp", "_lane")
 def _collect(
     # in
     map: PlaneMap,
@@ -53,9 +42,7 @@ def _collect(
     first_warp: int,
     # out
     voxels_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _collect_voxels(map, first_warp + warp, nodes, voxels_out)
+): ...
 
 
 def layers_of_planes(plane: np.ndarray, planes: int) -> np.ndarray:

@@ -29,13 +29,7 @@ class Layers:
     layer_stride: int
 
 
-@wp.func_native("lfpiv::share_row(lfpiv::line_map(map), row, absolute, values.data, shared_out.data);")
-def _share_row(
-    map: LineMap, row: int, absolute: bool, values: wp.array(dtype=float), shared_out: wp.array(dtype=float)
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::share_row(lfpiv::line_map(map), row, absolute, values.data, shared_out.data);")
 def _share(
     # in
     map: LineMap,
@@ -44,8 +38,7 @@ def _share(
     first_row: int,
     # out
     shared_out: wp.array(dtype=float),
-):
-    _share_row(map, first_row + wp.tid(), absolute, values, shared_out)
+): ...
 
 
 class LineShares:

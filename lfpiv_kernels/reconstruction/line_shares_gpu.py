@@ -10,13 +10,15 @@ from lfpiv_kernels.reconstruction.line_layout import LineMap
 wp.set_module_options(native.options("line_shares_gpu.h", contract="fast"))
 
 
-@wp.func_native("lfpiv::share_elements(lfpiv::line_map(map), warp, absolute, values.data, shared_out.data);")
-def _share_elements(
-    map: LineMap, warp: int, absolute: bool, values: wp.array(dtype=float), shared_out: wp.array(dtype=float)
-): ...
-
-
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::share_elements(
+        lfpiv::line_map(map), warp, absolute, values.data, shared_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _share(
     # in
     map: LineMap,
@@ -25,9 +27,7 @@ def _share(
     first_warp: int,
     # out
     shared_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _share_elements(map, first_warp + warp, absolute, values, shared_out)
+): ...
 
 
 def share(map: LineMap, absolute: bool, values: wp.array, shared_out: wp.array) -> None:

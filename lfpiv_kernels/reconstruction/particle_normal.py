@@ -42,26 +42,13 @@ class Images:
     """Pixels from the first to the last one of a particle, the most of all particles."""
 
 
-@wp.func_native("""
+@native.kernel("""
     lfpiv::multiply_images(
         images, particle, most, slot < 0 ? nullptr : scratch_out.data + (int64_t)slot * 4 * images.span,
         neighbour_out.data + (int64_t)particle * most, (float*)block_out.data + (int64_t)particle * most * 16,
         (float*)(right_out.data + particle)
     );
 """)
-def _multiply(
-    images: Images,
-    particle: int,
-    most: int,
-    slot: int,
-    scratch_out: wp.array(dtype=float),
-    neighbour_out: wp.array2d(dtype=int),
-    block_out: wp.array2d(dtype=wp.mat44f),
-    right_out: wp.array(dtype=wp.vec4f),
-): ...
-
-
-@wp.kernel
 def _multiply_images(
     # in
     images: Images,
@@ -73,8 +60,7 @@ def _multiply_images(
     neighbour_out: wp.array2d(dtype=int),
     block_out: wp.array2d(dtype=wp.mat44f),
     right_out: wp.array(dtype=wp.vec4f),
-):
-    _multiply(images, first_particle + wp.tid(), most, slot, scratch_out, neighbour_out, block_out, right_out)
+): ...
 
 
 @wp.struct

@@ -54,14 +54,6 @@ class PlacedRays:
     sets: int
 
 
-@wp.func_native("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
-def _collect_run(run: int, map: PixelRays, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
-
-
-@wp.func_native("lfpiv::spread(lfpiv::pixel_run(map, run), image.data, rays_out.data);")
-def _spread_run(run: int, map: PixelRays, image: wp.array(dtype=float), rays_out: wp.array(dtype=float)): ...
-
-
 @wp.func_native("""
     lfpiv::number_pixels(lfpiv::placed_rays(placed), number_out.data, pixel_out.data, first_out.data, count_out.data);
 """)
@@ -89,7 +81,7 @@ def _sort(
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
 def _collect(
     # in
     map: PixelRays,
@@ -97,11 +89,10 @@ def _collect(
     first_run: int,
     # out
     image_out: wp.array(dtype=float),
-):
-    _collect_run(first_run + wp.tid(), map, rays, image_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::spread(lfpiv::pixel_run(map, run), image.data, rays_out.data);")
 def _spread(
     # in
     map: PixelRays,
@@ -109,8 +100,7 @@ def _spread(
     first_run: int,
     # out
     rays_out: wp.array(dtype=float),
-):
-    _spread_run(first_run + wp.tid(), map, image, rays_out)
+): ...
 
 
 @wp.kernel

@@ -18,32 +18,7 @@ WARPS: int = native.constant("pixel_rays_gpu.h", "PIXEL_WARPS")
 """Warps that go through the pixels of a camera."""
 
 
-@wp.func_native("lfpiv::collect_pixels(map, warp, rays.data, image_out.data);")
-def _collect_pixels(map: PixelRays, warp: int, rays: wp.array(dtype=float), image_out: wp.array(dtype=float)): ...
-
-
-@wp.func_native("lfpiv::spread_pixels(map, warp, image.data, rays_out.data);")
-def _spread_pixels(map: PixelRays, warp: int, image: wp.array(dtype=float), rays_out: wp.array(dtype=float)): ...
-
-
-@wp.func_native("""
-    lfpiv::compare_pixels(map, warp, image.data, gain.data, floor, rays.data, rays_out.data,
-                          squares_out.data, divergence_out.data);
-""")
-def _compare_pixels(
-    map: PixelRays,
-    warp: int,
-    image: wp.array(dtype=float),
-    gain: wp.array(dtype=float),
-    floor: float,
-    rays: wp.array(dtype=float),
-    rays_out: wp.array(dtype=float),
-    squares_out: wp.array(dtype=wp.float64),
-    divergence_out: wp.array(dtype=wp.float64),
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::collect_pixels(map, warp, rays.data, image_out.data);", "warp", "_lane")
 def _collect(
     # in
     map: PixelRays,
@@ -51,12 +26,10 @@ def _collect(
     first_warp: int,
     # out
     image_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _collect_pixels(map, first_warp + warp, rays, image_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::spread_pixels(map, warp, image.data, rays_out.data);", "warp", "_lane")
 def _spread(
     # in
     map: PixelRays,
@@ -64,12 +37,18 @@ def _spread(
     first_warp: int,
     # out
     rays_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _spread_pixels(map, first_warp + warp, image, rays_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::compare_pixels(
+        map, warp, image.data, gain.data, floor, rays.data, rays_out.data, squares_out.data, divergence_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _compare(
     # in
     map: PixelRays,
@@ -82,9 +61,7 @@ def _compare(
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),  # per warp
     divergence_out: wp.array(dtype=wp.float64),
-):
-    warp, _lane = wp.tid()
-    _compare_pixels(map, first_warp + warp, image, gain, floor, rays, rays_out, squares_out, divergence_out)
+): ...
 
 
 def collect(map: PixelRays, rays: wp.array, image_out: wp.array) -> None:

@@ -59,37 +59,6 @@ class TiledMatrix:
     """Whether a scatter adds to the light on the rays: for one slab of voxels after the other."""
 
 
-@wp.func_native("lfpiv::gather_voxel(matrix, voxel, lenses, rays.data, active.data, volume_out.data);")
-def _gather_voxel(
-    matrix: TiledMatrix,
-    voxel: int,
-    lenses: int,
-    rays: wp.array(dtype=float),
-    active: wp.array(dtype=float),
-    volume_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("lfpiv::count_voxel(matrix, voxel, share.data, count_out.data);")
-def _count_voxel(matrix: TiledMatrix, voxel: int, share: wp.array(dtype=float), count_out: wp.array(dtype=int)): ...
-
-
-@wp.func_native("lfpiv::scatter_tile(matrix, tile, lenses, volume.data, rays_out.data);")
-def _scatter_tile(
-    matrix: TiledMatrix, tile: int, lenses: int, volume: wp.array(dtype=float), rays_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("lfpiv::align_values(matrix, first_value, level.data, voxel, word_out.data);")
-def _align_values(
-    matrix: TiledMatrix,
-    first_value: wp.array(dtype=wp.int64),
-    level: wp.array(dtype=wp.uint8),
-    voxel: int,
-    word_out: wp.array(dtype=wp.uint32),
-): ...
-
-
 @wp.func_native("lfpiv::count_entries(matrix, level.data, {edge, side}, count_out.data, set_out.data);")
 def _count_entries_of(
     matrix: TiledMatrix,
@@ -117,7 +86,7 @@ def _write_entries_of(
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::gather_voxel(matrix, voxel, lenses, rays.data, active.data, volume_out.data);", "voxel", "_lane")
 def _gather(
     # in
     matrix: TiledMatrix,  # a warp per voxel
@@ -127,12 +96,10 @@ def _gather(
     first_voxel: int,
     # out
     volume_out: wp.array(dtype=float),
-):
-    voxel, _lane = wp.tid()
-    _gather_voxel(matrix, first_voxel + voxel, lenses, rays, active, volume_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::scatter_tile(matrix, tile, lenses, volume.data, rays_out.data);", "tile", "_lane")
 def _scatter(
     # in
     matrix: TiledMatrix,  # a warp per tile
@@ -141,12 +108,10 @@ def _scatter(
     first_tile: int,
     # out
     rays_out: wp.array(dtype=float),
-):
-    tile, _lane = wp.tid()
-    _scatter_tile(matrix, first_tile + tile, lenses, volume, rays_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::count_voxel(matrix, voxel, share.data, count_out.data);", "voxel", "_lane")
 def _count_lit(
     # in
     matrix: TiledMatrix,  # a warp per voxel
@@ -154,12 +119,10 @@ def _count_lit(
     first_voxel: int,
     # out
     count_out: wp.array(dtype=int),
-):
-    voxel, _lane = wp.tid()
-    _count_voxel(matrix, first_voxel + voxel, share, count_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::align_values(matrix, first_value, level.data, voxel, word_out.data);")
 def _align(
     # in
     matrix: TiledMatrix,
@@ -168,8 +131,7 @@ def _align(
     first_voxel: int,
     # out
     word_out: wp.array(dtype=wp.uint32),
-):
-    _align_values(matrix, first_value, level, first_voxel + wp.tid(), word_out)
+): ...
 
 
 @wp.kernel

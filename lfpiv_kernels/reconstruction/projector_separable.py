@@ -50,7 +50,7 @@ class Part:
     strips: int
 
 
-@wp.func_native("""
+@native.kernel("""
     const auto weights = lfpiv::separable_arrays(separable);
     const int segments = (weights.lenses + segment - 1) / segment, number = task % segments;
     const int strip = part.first_strip + task / segments / part.rows;
@@ -60,50 +60,6 @@ class Part:
     lfpiv::project_segment(weights, volume.data, row, strip, number * segment, end,
                            lines_out.data + (slot < 0 ? 0 : slot) * lines, rays_out.data);
 """)
-def _project_segment(
-    separable: Separable,
-    volume: wp.array(dtype=float),
-    part: Part,
-    segment: int,
-    task: int,
-    slot: int,
-    lines_out: wp.array(dtype=float),
-    rays_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("""
-    const auto weights = lfpiv::separable_arrays(separable);
-    const int lenses = part.strips * weights.lenses, row = part.first_row + part.step * (task / lenses);
-    const int64_t lens = ((int64_t)row * weights.strips + part.first_strip) * weights.lenses + task % lenses;
-    lfpiv::turn_back_rim(weights, lens, rays.data, turned_out.data + (int64_t)task * weights.pixels * lfpiv::STRIP);
-""")
-def _turn_back(
-    separable: Separable,
-    rays: wp.array(dtype=float),
-    part: Part,
-    task: int,
-    turned_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("""
-    const auto weights = lfpiv::separable_arrays(separable);
-    float* const line = line_out.data + (int64_t)(slot < 0 ? 0 : slot) * lfpiv::line_size(weights);
-    lfpiv::gather_plane(weights, turned.data, part, plane, line, volume_out.data);
-""")
-def _gather_plane(
-    separable: Separable,
-    turned: wp.array(dtype=float),
-    part: Part,
-    plane: int,
-    slot: int,
-    line_out: wp.array(dtype=float),
-    volume_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _project(
     # in
     separable: Separable,
@@ -115,11 +71,15 @@ def _project(
     # out
     lines_out: wp.array(dtype=float),
     rays_out: wp.array(dtype=float),
-):
-    _project_segment(separable, volume, part, segment, first_task + wp.tid(), slot, lines_out, rays_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    const auto weights = lfpiv::separable_arrays(separable);
+    const int lenses = part.strips * weights.lenses, row = part.first_row + part.step * (task / lenses);
+    const int64_t lens = ((int64_t)row * weights.strips + part.first_strip) * weights.lenses + task % lenses;
+    lfpiv::turn_back_rim(weights, lens, rays.data, turned_out.data + (int64_t)task * weights.pixels * lfpiv::STRIP);
+""")
 def _turn(
     # in
     separable: Separable,
@@ -128,11 +88,14 @@ def _turn(
     first_task: int,
     # out
     turned_out: wp.array(dtype=float),
-):
-    _turn_back(separable, rays, part, first_task + wp.tid(), turned_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    const auto weights = lfpiv::separable_arrays(separable);
+    float* const line = line_out.data + (int64_t)(slot < 0 ? 0 : slot) * lfpiv::line_size(weights);
+    lfpiv::gather_plane(weights, turned.data, part, plane, line, volume_out.data);
+""")
 def _gather(
     # in
     separable: Separable,
@@ -143,8 +106,7 @@ def _gather(
     # out
     line_out: wp.array(dtype=float),
     volume_out: wp.array(dtype=float),
-):
-    _gather_plane(separable, turned, part, first_plane + wp.tid(), slot, line_out, volume_out)
+): ...
 
 
 class SeparableProjector(RayProjector):

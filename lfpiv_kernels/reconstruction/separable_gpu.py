@@ -45,89 +45,15 @@ class RayRows:
     count: int
 
 
-@wp.func_native("""
+@native.kernel(
+    """
     lfpiv::sum_down(
         lfpiv::separable_arrays(separable), warp, volume.data, lfpiv::ray_rows(rows), lines_out.data
     );
-""")
-def _sum_down(
-    separable: Separable, warp: int, volume: wp.array(dtype=float), rows: RayRows, lines_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("""
-    lfpiv::move_lines(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), back, lines_out.data
-    );
-""")
-def _move_lines(
-    separable: Separable,
-    warp: int,
-    lines: wp.array(dtype=float),
-    rows: RayRows,
-    back: bool,
-    lines_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::sum_across(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), bare_out.data
-    );
-""")
-def _sum_across(
-    separable: Separable, warp: int, lines: wp.array(dtype=float), rows: RayRows, bare_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("""
-    lfpiv::add_rim(lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), rays_out.data);
-""")
-def _add_rim(
-    separable: Separable, warp: int, bare: wp.array(dtype=float), rows: RayRows, rays_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("""
-    lfpiv::turn_back_rim(lfpiv::separable_arrays(separable), warp, rays.data, lfpiv::ray_rows(rows), bare_out.data);
-""")
-def _turn_back_rim(
-    separable: Separable, warp: int, rays: wp.array(dtype=float), rows: RayRows, bare_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("""
-    lfpiv::return_across(
-        lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), lit, lines_out.data
-    );
-""")
-def _return_across(
-    separable: Separable,
-    warp: int,
-    bare: wp.array(dtype=float),
-    rows: RayRows,
-    lit: bool,
-    lines_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::return_down(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), active.data, lit, volume_out.data
-    );
-""")
-def _return_down(
-    separable: Separable,
-    warp: int,
-    lines: wp.array(dtype=float),
-    rows: RayRows,
-    active: wp.array(dtype=float),
-    lit: bool,
-    volume_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+    """,
+    "warp",
+    "_lane",
+)
 def _down(
     # in
     separable: Separable,
@@ -136,12 +62,18 @@ def _down(
     first_warp: int,
     # out
     lines_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _sum_down(separable, first_warp + warp, volume, rows, lines_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::move_lines(
+        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), back, lines_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _move(
     # in
     separable: Separable,
@@ -151,12 +83,18 @@ def _move(
     first_warp: int,
     # out
     lines_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _move_lines(separable, first_warp + warp, lines, rows, back, lines_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::sum_across(
+        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), bare_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _across(
     # in
     separable: Separable,
@@ -165,12 +103,18 @@ def _across(
     first_warp: int,
     # out
     bare_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _sum_across(separable, first_warp + warp, lines, rows, bare_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::add_rim(
+        lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), rays_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _rim(
     # in
     separable: Separable,
@@ -179,12 +123,18 @@ def _rim(
     first_warp: int,
     # out
     rays_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _add_rim(separable, first_warp + warp, bare, rows, rays_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::turn_back_rim(
+        lfpiv::separable_arrays(separable), warp, rays.data, lfpiv::ray_rows(rows), bare_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _rim_back(
     # in
     separable: Separable,
@@ -193,12 +143,18 @@ def _rim_back(
     first_warp: int,
     # out
     bare_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _turn_back_rim(separable, first_warp + warp, rays, rows, bare_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::return_across(
+        lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), lit, lines_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _across_back(
     # in
     separable: Separable,
@@ -208,12 +164,19 @@ def _across_back(
     first_warp: int,
     # out
     lines_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _return_across(separable, first_warp + warp, bare, rows, lit, lines_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::return_down(
+        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), active.data, lit,
+        volume_out.data
+    );
+    """,
+    "warp",
+    "_lane",
+)
 def _down_back(
     # in
     separable: Separable,
@@ -224,9 +187,7 @@ def _down_back(
     first_warp: int,
     # out
     volume_out: wp.array(dtype=float),
-):
-    warp, _lane = wp.tid()
-    _return_down(separable, first_warp + warp, lines, rows, active, lit, volume_out)
+): ...
 
 
 class LinesProjector:

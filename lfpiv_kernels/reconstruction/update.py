@@ -28,26 +28,12 @@ SMALLEST: float = native.constant("steps.h", "SMALLEST")
 """Least light of an active voxel under momentum: smaller float32 numbers are slow, and a zero would stay zero."""
 
 
-@wp.func_native("""
+@native.kernel("""
     lfpiv::compare(
-        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays.data, rays_out.data,
-        squares_out.data, divergence_out.data
+        lfpiv::pixel_run(map, run), image.data, gain.data, floor, rays.data, rays_out.data, squares_out.data,
+        divergence_out.data
     );
 """)
-def _compare_run(
-    run: int,
-    map: PixelRays,
-    image: wp.array(dtype=float),
-    gain: wp.array(dtype=float),
-    floor: float,
-    rays: wp.array(dtype=float),
-    rays_out: wp.array(dtype=float),
-    squares_out: wp.array(dtype=wp.float64),
-    divergence_out: wp.array(dtype=wp.float64),
-): ...
-
-
-@wp.kernel
 def _compare(
     # in
     map: PixelRays,
@@ -60,31 +46,15 @@ def _compare(
     rays_out: wp.array(dtype=float),
     squares_out: wp.array(dtype=wp.float64),  # per run
     divergence_out: wp.array(dtype=wp.float64),
-):
-    _compare_run(first_run + wp.tid(), map, image, gain, floor, rays, rays_out, squares_out, divergence_out)
+): ...
 
 
-@wp.func_native("""
+@native.kernel("""
     lfpiv::update(
         run, size, volume.data, exponent.data, step.data, length, last.data, momentum, stepped_out.data,
         ahead_out.data
     );
 """)
-def _update_run(
-    run: int,
-    size: int,
-    volume: wp.array(dtype=float),
-    exponent: wp.array(dtype=float),
-    step: wp.array(dtype=float),
-    length: float,
-    last: wp.array(dtype=float),
-    momentum: float,
-    stepped_out: wp.array(dtype=float),
-    ahead_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
 def _update(
     # in
     volume: wp.array(dtype=float),
@@ -98,33 +68,15 @@ def _update(
     # out
     stepped_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
-):
-    run = first_run + wp.tid()
-    _update_run(run, size, volume, exponent, step, length, last, momentum, stepped_out, ahead_out)
-
-
-@wp.func_native("""
-    lfpiv::sharpen(
-        run, size, volume.data, logarithm.data, blurred.data, share, largest, last.data, momentum,
-        stepped_out.data, ahead_out.data
-    );
-""")
-def _sharpen_run(
-    run: int,
-    size: int,
-    volume: wp.array(dtype=float),
-    logarithm: wp.array(dtype=float),
-    blurred: wp.array(dtype=float),
-    share: float,
-    largest: float,
-    last: wp.array(dtype=float),
-    momentum: float,
-    stepped_out: wp.array(dtype=float),
-    ahead_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::sharpen(
+        run, size, volume.data, logarithm.data, blurred.data, share, largest, last.data, momentum, stepped_out.data,
+        ahead_out.data
+    );
+""")
 def _sharpen(
     # in
     volume: wp.array(dtype=float),
@@ -139,9 +91,7 @@ def _sharpen(
     # out
     stepped_out: wp.array(dtype=float),
     ahead_out: wp.array(dtype=float),
-):
-    run = first_run + wp.tid()
-    _sharpen_run(run, size, volume, logarithm, blurred, share, largest, last, momentum, stepped_out, ahead_out)
+): ...
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,7 @@ FEWEST_VOXELS = 2**18
 """Smallest part of a launch. Two threads take longer than one for 150,000 voxels, and as long for a million."""
 
 
-@wp.func_native("lfpiv::multiply(run, size, one.data, factor, other.data, product_out.data);")
-def _multiply_run(
-    run: int,
-    size: int,
-    one: wp.array(dtype=float),
-    factor: float,
-    other: wp.array(dtype=float),
-    product_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::multiply(run, size, one.data, factor, other.data, product_out.data);")
 def _multiply(
     # in
     one: wp.array(dtype=float),
@@ -38,22 +27,10 @@ def _multiply(
     first_run: int,
     # out
     product_out: wp.array(dtype=float),
-):
-    _multiply_run(first_run + wp.tid(), size, one, factor, other, product_out)
-
-
-@wp.func_native("lfpiv::divide(run, size, numerator.data, denominator.data, least, quotient_out.data);")
-def _divide_run(
-    run: int,
-    size: int,
-    numerator: wp.array(dtype=float),
-    denominator: wp.array(dtype=float),
-    least: float,
-    quotient_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::divide(run, size, numerator.data, denominator.data, least, quotient_out.data);")
 def _divide(
     # in
     numerator: wp.array(dtype=float),
@@ -63,20 +40,10 @@ def _divide(
     first_run: int,
     # out
     quotient_out: wp.array(dtype=float),
-):
-    _divide_run(first_run + wp.tid(), size, numerator, denominator, least, quotient_out)
-
-
-@wp.func_native("lfpiv::indicate(run, size, volume.data, lit_out.data);")
-def _indicate_run(
-    run: int,
-    size: int,
-    volume: wp.array(dtype=float),
-    lit_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::indicate(run, size, volume.data, lit_out.data);")
 def _indicate(
     # in
     volume: wp.array(dtype=float),
@@ -84,21 +51,10 @@ def _indicate(
     first_run: int,
     # out
     lit_out: wp.array(dtype=float),
-):
-    _indicate_run(first_run + wp.tid(), size, volume, lit_out)
-
-
-@wp.func_native("lfpiv::add_masked(run, size, added.data, mask.data, volume_out.data);")
-def _add_run(
-    run: int,
-    size: int,
-    added: wp.array(dtype=float),
-    mask: wp.array(dtype=float),
-    volume_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::add_masked(run, size, added.data, mask.data, volume_out.data);")
 def _add(
     # in
     added: wp.array(dtype=float),
@@ -107,15 +63,10 @@ def _add(
     first_run: int,
     # out
     volume_out: wp.array(dtype=float),
-):
-    _add_run(first_run + wp.tid(), size, added, mask, volume_out)
+): ...
 
 
-@wp.func_native("lfpiv::darken(run, size, volume.data, darkened_out.data);")
-def _darken_run(run: int, size: int, volume: wp.array(dtype=float), darkened_out: wp.array(dtype=float)): ...
-
-
-@wp.kernel
+@native.kernel("lfpiv::darken(run, size, volume.data, darkened_out.data);")
 def _darken(
     # in
     volume: wp.array(dtype=float),
@@ -123,21 +74,10 @@ def _darken(
     first_run: int,
     # out
     darkened_out: wp.array(dtype=float),
-):
-    _darken_run(first_run + wp.tid(), size, volume, darkened_out)
-
-
-@wp.func_native("lfpiv::part(run, size, least.data[0], light_out.data, active_out.data);")
-def _part_run(
-    run: int,
-    size: int,
-    least: wp.array(dtype=float),
-    light_out: wp.array(dtype=float),
-    active_out: wp.array(dtype=float),
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::part(run, size, least.data[0], light_out.data, active_out.data);")
 def _part(
     # in
     least: wp.array(dtype=float),
@@ -146,8 +86,7 @@ def _part(
     # out
     light_out: wp.array(dtype=float),
     active_out: wp.array(dtype=float),
-):
-    _part_run(first_run + wp.tid(), size, least, light_out, active_out)
+): ...
 
 
 def multiply(one: wp.array, other: wp.array, out: wp.array | None = None, *, factor: float = 1.0) -> wp.array:

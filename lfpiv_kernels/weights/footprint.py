@@ -49,54 +49,11 @@ SCRATCH_BYTES = 1 << 26
 """Values that are computed before they are packed [byte]."""
 
 
-@wp.func_native(
-    "lfpiv::measure(lfpiv::weight_inputs(inputs), voxel, lenses_out.data, blocks_out.data, bytes_out.data);"
-)
-def _measure(
-    inputs: Inputs,
-    voxel: int,
-    lenses_out: wp.array(dtype=int),
-    blocks_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::fill(
-        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel,
-        lfpiv::block_arrays(blocks_out), scale_out.data, counts_out.data, bytes_out.data
+@native.kernel("""
+    lfpiv::measure(
+        lfpiv::weight_inputs(inputs), voxel, lenses_out.data, blocks_out.data, bytes_out.data
     );
 """)
-def _fill(
-    inputs: Inputs,
-    outline: Outline,
-    voxel: int,
-    blocks_out: BlockArrays,
-    scale_out: wp.array(dtype=float),
-    counts_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::pack(
-        lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel, profiles, edge, lenses,
-        even_blocks_out.data, even_values_out.data
-    );
-""")
-def _pack(
-    blocks: BlockArrays,
-    voxel: int,
-    profiles: bool,
-    edge: int,
-    lenses: int,
-    packed_out: BlockArrays,
-    even_blocks_out: wp.array(dtype=int),
-    even_values_out: wp.array(dtype=int),
-): ...
-
-
-@wp.kernel
 def _measure_blocks(
     # in
     inputs: Inputs,
@@ -105,11 +62,15 @@ def _measure_blocks(
     lenses_out: wp.array(dtype=int),  # lenses that each voxel reaches
     blocks_out: wp.array(dtype=int),  # blocks and values that it needs at most
     bytes_out: wp.array(dtype=int),
-):
-    _measure(inputs, first_voxel + wp.tid(), lenses_out, blocks_out, bytes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::fill(
+        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel,
+        lfpiv::block_arrays(blocks_out), scale_out.data, counts_out.data, bytes_out.data
+    );
+""")
 def _fill_blocks(
     # in
     inputs: Inputs,
@@ -120,11 +81,15 @@ def _fill_blocks(
     scale_out: wp.array(dtype=float),
     counts_out: wp.array(dtype=int),  # blocks and values of each voxel
     bytes_out: wp.array(dtype=int),
-):
-    _fill(inputs, outline, first_voxel + wp.tid(), blocks_out, scale_out, counts_out, bytes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::pack(
+        lfpiv::block_arrays(blocks), lfpiv::block_arrays(packed_out), voxel, profiles, edge, lenses,
+        even_blocks_out.data, even_values_out.data
+    );
+""")
 def _pack_blocks(
     # in
     blocks: BlockArrays,
@@ -136,9 +101,7 @@ def _pack_blocks(
     packed_out: BlockArrays,  # without gaps, those of even lenses first
     even_blocks_out: wp.array(dtype=int),  # blocks and values of each voxel under even lenses
     even_values_out: wp.array(dtype=int),
-):
-    voxel = first_voxel + wp.tid()
-    _pack(blocks, voxel, profiles, edge, lenses, packed_out, even_blocks_out, even_values_out)
+): ...
 
 
 class Footprints:

@@ -31,72 +31,6 @@ class Tiles:
 
 
 @wp.func_native("""
-    lfpiv::measure_lens(
-        lfpiv::weight_inputs(inputs), lfpiv::tile_room(shape), voxel, lens, blocks_out.data, bytes_out.data
-    );
-""")
-def _measure(
-    inputs: Inputs,
-    shape: Tiles,
-    voxel: int,
-    lens: int,
-    blocks_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::fill_tile<true>(
-        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel, tile,
-        lfpiv::tile_room(room), lfpiv::block_arrays(blocks_out), counts_out.data, bytes_out.data
-    );
-""")
-def _fill_profiles_of(
-    inputs: Inputs,
-    outline: Outline,
-    voxel: int,
-    tile: int,
-    room: Tiles,
-    blocks_out: BlockArrays,
-    counts_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::fill_tile<false>(
-        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel, tile,
-        lfpiv::tile_room(room), lfpiv::block_arrays(blocks_out), counts_out.data, bytes_out.data
-    );
-""")
-def _fill_pixels_of(
-    inputs: Inputs,
-    outline: Outline,
-    voxel: int,
-    tile: int,
-    room: Tiles,
-    blocks_out: BlockArrays,
-    counts_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::sum_tiles(
-        lfpiv::weight_inputs(inputs), voxel, lfpiv::tile_room(filled), scale_out.data, counts_out.data, bytes_out.data
-    );
-""")
-def _sum(
-    inputs: Inputs,
-    voxel: int,
-    filled: Tiles,
-    scale_out: wp.array(dtype=float),
-    counts_out: wp.array(dtype=int),
-    bytes_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
     lfpiv::pack_place(
         lfpiv::block_arrays(blocks), lfpiv::tile_room(filled), lfpiv::block_arrays(packed_out), voxel, place,
         lfpiv::BlockOrder(profiles, edge, lenses), even_blocks_out.data, even_values_out.data
@@ -116,7 +50,15 @@ def _pack(
 ): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::measure_lens(
+        lfpiv::weight_inputs(inputs), lfpiv::tile_room(shape), voxel, lens, blocks_out.data, bytes_out.data
+    );
+    """,
+    "voxel",
+    "lens",
+)
 def _measure_tiles(
     # in
     inputs: Inputs,
@@ -125,12 +67,19 @@ def _measure_tiles(
     # out
     blocks_out: wp.array(dtype=int),  # blocks and values that each tile needs at most
     bytes_out: wp.array(dtype=int),
-):
-    voxel, lens = wp.tid()
-    _measure(inputs, shape, first_voxel + voxel, lens, blocks_out, bytes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::fill_tile<true>(
+        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel, tile,
+        lfpiv::tile_room(room), lfpiv::block_arrays(blocks_out), counts_out.data, bytes_out.data
+    );
+    """,
+    "voxel",
+    "tile",
+)
 def _fill_profiles(
     # in
     inputs: Inputs,
@@ -141,12 +90,19 @@ def _fill_profiles(
     blocks_out: BlockArrays,
     counts_out: wp.array(dtype=int),  # blocks and values of each tile
     bytes_out: wp.array(dtype=int),
-):
-    voxel, tile = wp.tid()
-    _fill_profiles_of(inputs, outline, first_voxel + voxel, tile, room, blocks_out, counts_out, bytes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::fill_tile<false>(
+        lfpiv::weight_inputs(inputs), {outline.extent.data, outline.steps, outline.square}, voxel, tile,
+        lfpiv::tile_room(room), lfpiv::block_arrays(blocks_out), counts_out.data, bytes_out.data
+    );
+    """,
+    "voxel",
+    "tile",
+)
 def _fill_pixels(
     # in
     inputs: Inputs,
@@ -157,12 +113,15 @@ def _fill_pixels(
     blocks_out: BlockArrays,
     counts_out: wp.array(dtype=int),  # blocks and values of each tile
     bytes_out: wp.array(dtype=int),
-):
-    voxel, tile = wp.tid()
-    _fill_pixels_of(inputs, outline, first_voxel + voxel, tile, room, blocks_out, counts_out, bytes_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::sum_tiles(
+        lfpiv::weight_inputs(inputs), voxel, lfpiv::tile_room(filled), scale_out.data, counts_out.data,
+        bytes_out.data
+    );
+""")
 def _sum_tiles(
     # in
     inputs: Inputs,
@@ -172,8 +131,7 @@ def _sum_tiles(
     scale_out: wp.array(dtype=float),
     counts_out: wp.array(dtype=int),  # blocks and values of each voxel
     bytes_out: wp.array(dtype=int),
-):
-    _sum(inputs, first_voxel + wp.tid(), filled, scale_out, counts_out, bytes_out)
+): ...
 
 
 @wp.kernel

@@ -65,13 +65,11 @@ class Layout:
     curvature: float
 
 
-@wp.func_native("""
-    lfpiv::write_lens_rays(lfpiv::microimage_layout(layout), lens, pixel_out.data, share_out.data);
+@native.kernel("""
+    lfpiv::write_lens_rays(
+        lfpiv::microimage_layout(layout), lens, pixel_out.data, share_out.data
+    );
 """)
-def _write_rays(layout: Layout, lens: int, pixel_out: wp.array(dtype=int), share_out: wp.array(dtype=float)): ...
-
-
-@wp.kernel
 def _write_lens_rays(
     # in
     layout: Layout,
@@ -79,8 +77,7 @@ def _write_lens_rays(
     # out
     pixel_out: wp.array(dtype=int),
     share_out: wp.array(dtype=float),
-):
-    _write_rays(layout, first_lens + wp.tid(), pixel_out, share_out)
+): ...
 
 
 def lens_rays(first_lens, centre, radius, edge, sensor_shape):

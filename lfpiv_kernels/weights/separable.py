@@ -41,87 +41,9 @@ class RayLayout:
     ray_rows: int
 
 
-@wp.func_native("""
+@native.kernel("""
     top_out.data[block] = lfpiv::top_of_block(lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block);
 """)
-def _top_of_block(
-    inputs: Inputs, rays: RayLayout, rows: int, columns: int, blocks: int, block: int, top_out: wp.array(dtype=float)
-): ...
-
-
-@wp.func_native("""
-    lfpiv::measure_down(
-        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, (short*)first_out.data,
-        (short*)last_out.data);
-""")
-def _measure_block(
-    inputs: Inputs,
-    rays: RayLayout,
-    rows: int,
-    columns: int,
-    blocks: int,
-    block: int,
-    per_level: float,
-    first_out: wp.array(dtype=wp.int16),
-    last_out: wp.array(dtype=wp.int16),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::fill_down(
-        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, taps, (const short*)first.data,
-        level_out.data);
-""")
-def _fill_block(
-    inputs: Inputs,
-    rays: RayLayout,
-    rows: int,
-    columns: int,
-    blocks: int,
-    block: int,
-    per_level: float,
-    taps: int,
-    first: wp.array(dtype=wp.int16),
-    level_out: wp.array(dtype=wp.uint8),
-): ...
-
-
-@wp.func_native("""
-    const int64_t lenses = (int64_t)strip * rays.lenses * rays.pixels;
-    lfpiv::find_across(
-        lfpiv::ray_layout(inputs, rays), strip, columns, least, lens_out.data + 3 * strip,
-        (short*)first_out.data + lenses, value_out.data + lenses * lfpiv::MOST_TAPS * lfpiv::PARTS);
-""")
-def _across_strip(
-    inputs: Inputs,
-    rays: RayLayout,
-    columns: int,
-    strip: int,
-    least: float,
-    lens_out: wp.array(dtype=int),
-    first_out: wp.array(dtype=wp.int16),
-    value_out: wp.array(dtype=float),
-): ...
-
-
-@wp.func_native("""
-    const int strip = at / rays.lenses % rays.strips, lens = at % rays.lenses, row = at / (rays.lenses * rays.strips);
-    const int64_t ray = (int64_t)at * rays.pixels * lfpiv::STRIP;
-    lfpiv::write_ray_row(
-        lfpiv::ray_layout(inputs, rays), row, strip, lens, pixel_out.data + ray, share_out.data + ray,
-        (signed char*)rim_out.data + ray);
-""")
-def _write_rays_of(
-    inputs: Inputs,
-    rays: RayLayout,
-    at: int,
-    pixel_out: wp.array(dtype=int),
-    share_out: wp.array(dtype=float),
-    rim_out: wp.array(dtype=wp.int8),
-): ...
-
-
-@wp.kernel
 def _top(
     # in
     inputs: Inputs,
@@ -132,11 +54,15 @@ def _top(
     first_block: int,
     # out
     top_out: wp.array(dtype=float),
-):
-    _top_of_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), top_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::measure_down(
+        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, (short*)first_out.data,
+        (short*)last_out.data
+    );
+""")
 def _measure(
     # in
     inputs: Inputs,
@@ -149,11 +75,15 @@ def _measure(
     # out
     first_out: wp.array(dtype=wp.int16),
     last_out: wp.array(dtype=wp.int16),
-):
-    _measure_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), per_level, first_out, last_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::fill_down(
+        lfpiv::ray_layout(inputs, rays), {rows, columns, blocks}, block, per_level, taps, (const short*)first.data,
+        level_out.data
+    );
+""")
 def _fill(
     # in
     inputs: Inputs,
@@ -167,11 +97,15 @@ def _fill(
     first_block: int,
     # out
     level_out: wp.array(dtype=wp.uint8),
-):
-    _fill_block(inputs, rays, rows, columns, blocks, first_block + wp.tid(), per_level, taps, first, level_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    const int64_t lenses = (int64_t)strip * rays.lenses * rays.pixels;
+    lfpiv::find_across(
+        lfpiv::ray_layout(inputs, rays), strip, columns, least, lens_out.data + 3 * strip,
+        (short*)first_out.data + lenses, value_out.data + lenses * lfpiv::MOST_TAPS * lfpiv::PARTS);
+""")
 def _across(
     # in
     inputs: Inputs,
@@ -183,22 +117,26 @@ def _across(
     lens_out: wp.array(dtype=int),
     first_out: wp.array(dtype=wp.int16),
     value_out: wp.array(dtype=float),
-):
-    _across_strip(inputs, rays, columns, first_strip + wp.tid(), least, lens_out, first_out, value_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    const int strip = at / rays.lenses % rays.strips, lens = at % rays.lenses, row = at / (rays.lenses * rays.strips);
+    const int64_t ray = (int64_t)at * rays.pixels * lfpiv::STRIP;
+    lfpiv::write_ray_row(
+        lfpiv::ray_layout(inputs, rays), row, strip, lens, pixel_out.data + ray, share_out.data + ray,
+        (signed char*)rim_out.data + ray);
+""")
 def _write_rays(
     # in
     inputs: Inputs,
     rays: RayLayout,
-    first: int,
+    first_at: int,
     # out
     pixel_out: wp.array(dtype=int),
     share_out: wp.array(dtype=float),
     rim_out: wp.array(dtype=wp.int8),
-):
-    _write_rays_of(inputs, rays, first + wp.tid(), pixel_out, share_out, rim_out)
+): ...
 
 
 class Profiles:

@@ -141,12 +141,11 @@ def test_pixels_of_a_gpu_are_those_of_the_cpu(lenses):
     pixel_rays_gpu.collect(map_.rays, tiled.rays, to_device(found, float))
     np.testing.assert_allclose(found, expected, atol=TOLERANCE_SUM * expected.max())
     image = rng.random(size).astype(np.float32) * expected.max() + 0.1
-    gain, held = rng.random((2, size)).astype(np.float32)
+    gain = rng.random(size).astype(np.float32)
     comparison = Comparison(projector, image, gain, 0.3)
-    comparison._held.assign(held[projector.map.pixel])
     totals = Totals(2)
     comparison.compare(to_device(volume, float), totals, lenses)
-    of_map = [to_device(values[map_.pixel], float) for values in (image, gain, held)]
+    of_map = [to_device(values[map_.pixel], float) for values in (image, gain)]
     tiled.scatter(to_device(volume, float), lenses)
     of_warps = [to_device(np.zeros(pixel_rays_gpu.WARPS)) for _ in range(2)]
     apart = to_device(np.zeros(len(tiled.rays), np.float32), float)
