@@ -6,8 +6,9 @@ mistake before any pair is reconstructed. Its refusals go with the pairs, whose 
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import chain, islice
@@ -15,9 +16,10 @@ from typing import TYPE_CHECKING
 
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
-from lfpiv.selfcalibration.belonging import FLIPS, IN_TIME, SURE, ImageFit, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration import dark_parts
+from lfpiv.selfcalibration.belonging import FLIPS, IN_TIME, SURE, ImageFit, Images, Judgement, Kind, Mistake, judge
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL
-from lfpiv.warn import Code, Warning, name_pairs
+from lfpiv.warn import Code, Warning, name_pairs, warn
 
 if TYPE_CHECKING:
     from lfpiv.experiment.experiment import Experiment
@@ -64,6 +66,8 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
             refusals=tuple(refusals),
             level=logging.WARNING,
         )
+    for warning in _dark_warnings(weights, _light(shown, dict.fromkeys((*judged, *tried)))):
+        warn(log, warning)
     found = moved_cameras.check(shown, weights)
     cameras, used = " and ".join(names), name_pairs(list(judged), experiment.noun)
     if isinstance(found, CameraDisparity):
@@ -92,6 +96,28 @@ def refusals_of(shown: ShownParticles, fit: ImageFit, pair: int) -> list[Warning
         return []
     figures = {"found": f"{' and '.join(names)} show different particles", "remedy": "Check the images of this pair"}
     return [_numbered(experiment, Warning(code=Code.MISMATCHED, figures=figures), pair)]
+
+
+def _light(shown: ShownParticles, pairs: Iterable[int]) -> Iterator[Sequence[Images]]:
+    """Yield the images of both frames of the pairs that can be used."""
+    for pair in pairs:
+        with contextlib.suppress(ValueError):  # a pair that cannot be used fails when it is reconstructed
+            yield shown.pair(pair)
+
+
+def _dark_warnings(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[Warning]:
+    """Return the warnings about parts of sensors that show no particles although other cameras do."""
+    return [
+        Warning(
+            code=Code.DARK_PART,
+            subject=part.camera,
+            figures={
+                **dict(zip(("top", "bottom", "left", "right"), (*part.rows, *part.columns), strict=True)),
+                "others": " and ".join(name for name in weights.cameras if name != part.camera),
+            },
+        )
+        for part in dark_parts.find(weights, pairs)
+    ]
 
 
 def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:

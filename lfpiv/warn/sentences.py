@@ -17,6 +17,7 @@ class Code(enum.Enum):
     UNEVEN = "uneven"
     STANDING = "standing"
     COPIED = "copied"
+    DARK_PART = "dark_part"
     DIM = "dim"
     EMPTY = "empty"
     # white image and microlens array
@@ -108,6 +109,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.COPIED: (
         "an image is a copy, byte by byte, of an image of {noun} {first:.0f}, so the same light counts twice. Check "
         "particles.images, and what was copied"
+    ),
+    Code.DARK_PART: (
+        "rows {top} to {bottom}, columns {left} to {right} show no particles where {others} would have them, although "
+        "the white image is lit there: that part of the sensor is dark, or something stands before it. Look at the "
+        "particle images; vectors there rest on the other views alone"
     ),
     Code.DIM: (
         "particles hardly rise above the noise (light of near pixels correlates by {structure:.2f}; clear images "

@@ -108,6 +108,11 @@ class Weights(Shown):
         """Return the weights of one of the cameras. They share memory with these."""
         return Weights(self.stored, {name: self.cameras[name]}, {name: self.projector(name)}, self.method)
 
+    def without(self, name: str) -> Weights:
+        """Return the weights of all cameras but one. They share memory with these."""
+        others = {other: camera for other, camera in self.cameras.items() if other != name}
+        return Weights(self.stored, others, {other: self.projector(other) for other in others}, self.method)
+
     def __call__(self, volume: np.ndarray, out: Images | None = None) -> Images:
         """Project a volume: image[pixel] = sum over voxels of weight * volume (Eq. 4).
 

@@ -1,0 +1,63 @@
+"""Parts of a sensor that are dark although the other cameras see particles there."""
+
+import numpy as np
+import pytest
+
+import lfpiv
+from lfpiv.runs.frame_light import frame_light, read_darks
+from lfpiv.selfcalibration.dark_parts import find
+
+WIDER = 1.5
+"""Width of a volume that particles do not fill, over their own."""
+
+
+@pytest.fixture(scope="module")
+def rig(small_run):
+    experiment = lfpiv.open_experiment(small_run.experiment)
+    return experiment, lfpiv.load_calibration(small_run.out / "calibration.h5")
+
+
+@pytest.fixture(scope="module")
+def weights(rig):
+    return lfpiv.build_weights(rig[1], rig[0].grid)
+
+
+@pytest.fixture(scope="module")
+def pairs(rig, weights):
+    experiment, darks = rig[0], read_darks(rig[0])
+    frames = [
+        [frame_light(experiment, weights.cameras, darks, one).images for one in experiment.pair_frames(pair)]
+        for pair in (0, 1, 2)
+    ]
+    return frames
+
+
+def darkened(pairs, name, part):
+    made = [[dict(images) for images in pair] for pair in pairs]
+    for images in (images for pair in made for images in pair):
+        images[name] = images[name].copy()
+        images[name][part] = 0
+    return made
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "rows", "columns"),
+    [
+        ("left", np.s_[:, 267:], (0, 399), (267, 399)),
+        ("right", np.s_[:133], (0, 132), (0, 399)),
+    ],
+    ids=["columns", "rows"],
+)
+def test_a_dark_third_of_a_sensor_is_found(weights, pairs, name, part, rows, columns):
+    (found,) = find(weights, darkened(pairs, name, part))
+    cell = 3 * weights.cameras[name].optics.microimage_pitch_px
+    assert found.camera == name
+    for (first, last), (low, high) in ((found.rows, rows), (found.columns, columns)):
+        assert low - cell < first < last < high + cell and last - first > 2 * cell
+
+
+def test_sound_images_have_no_dark_part_even_in_a_volume_that_they_do_not_fill(rig, weights, pairs):
+    assert not find(weights, pairs) and not find(weights, pairs[:1])
+    grid = rig[0].grid
+    wide = grid.padded(grid.layers((0.0, 0.0, (WIDER - 1) / 2 * np.ptp(grid.axis_mm(2)))))
+    assert not find(lfpiv.build_weights(rig[1], wide), pairs)
