@@ -11,6 +11,8 @@ from lfpiv_kernels import caches, runtime
 
 _loaded: set[tuple[str, str]] = set()
 """Modules and devices that `load` has met in this process."""
+_ready: set[tuple[wp.Kernel, str]] = set()
+"""Kernels and devices whose module is loaded. Warp takes as long to find that out as to launch a kernel."""
 _loading = threading.RLock()  # Warp compiles in one thread at a time
 
 
@@ -47,12 +49,15 @@ def launch(*calls: Call, parts: int | None = None, device: str | None = None) ->
     device = device or where.warp
     for call in calls:
         load(call.kernel, device)  # before threads start: compilation is not thread-safe
-    on_cpu = runtime.on_threads(device)
-    if not on_cpu:
-        parts = 1
-    elif parts is None:
+    if not runtime.on_threads(device):
+        for call in calls:
+            if call.size:
+                inputs = [*call.inputs, -1, 0] if call.scratch else [*call.inputs, 0]
+                wp.launch(call.kernel, dim=(call.size, *call.inner), inputs=inputs, outputs=call.outputs, device=device)
+        return
+    if parts is None:
         parts = min(runtime.CHUNKS // len(calls), 2 * where.threads)  # each launch costs Python time
-    free = list(range(runtime.CHUNKS)) if on_cpu else [-1]  # a stack: memory used last is still in the caches
+    free = list(range(runtime.CHUNKS))  # a stack: memory used last is still in the caches
 
     def run(_: int, begin: int, end: int) -> None:
         for index in range(begin, end):
@@ -80,6 +85,8 @@ def parts_of(size: int, fewest: int) -> int:
 
 def load(kernel: wp.Kernel, device: str) -> None:
     """Load the module of a kernel on a device. Log that kernels are compiled if the module is not in the cache."""
+    if (kernel, device) in _ready:
+        return
     module = kernel.module
     with _loading:
         if (module.name, device) not in _loaded:
@@ -88,3 +95,4 @@ def load(kernel: wp.Kernel, device: str) -> None:
             if not (folder / module.get_module_identifier(1 if device == "cpu" else None)).is_dir():
                 caches.log_compilation(folder)
         wp.load_module(module, device=device)
+        _ready.add((kernel, device))

@@ -18,6 +18,7 @@ from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.simulator import simulate
 from lfpiv.velocity.settings import CorrelationSettings
+from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,8 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
         If the folder cannot be written.
     """
     out, report = Path(out), progress or ignore_progress
+    if device is not None:
+        runtime.start(device)  # before the simulation, which takes any device
     with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
         experiment = out / "experiment" / "experiment.toml"

@@ -1,0 +1,630 @@
+"""The stages of `gpu`: each runs in a process of its own and writes what it finds, as it finds it, to a JSON file.
+
+    python perf/gpu_stages.py STAGE FOLDER [--scale small|paper] [--minutes M] [--sample FOLDER]
+
+Without a GPU the stages run on the CPU: with ``LFPIV_EMULATE_GPU=1`` by the loops for a GPU, at scale "small". So their
+own code is tested. Times then mean nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = ("tests/kernels", "tests/weights", "tests/reconstruction", "tests/velocity")
+"""Folders of the tests that launch kernels; their twins of NumPy are the judges."""
+TAICHI_TESTS = (
+    "tests/simulation", "tests/calibration/test_network.py", "tests/weights/test_operator.py",
+    "tests/weights/test_counted_grid.py",
+)  # fmt: skip
+PAIRS = 20
+"""Pairs in a row of the throughput."""
+VECTORS_VOXEL = 0.02
+"""Largest rms difference of the vectors of two devices [voxel]: sums in another order move a fit of SMART by a tenth of
+its error, which is 0.1 to 0.2 voxel."""
+COPIED = {"small": 1 << 20, "paper": 1 << 28}
+"""Floats that a copy reads and writes to measure the bandwidth of the memory."""
+TINY: dict[str, Any] = {"voxels": 16, "sensor": (400, 560)}
+"""Volume and sensor that compute-sanitizer, which takes a hundred times as long, can look at."""
+REPEATS = 10
+PROFILED = 40
+"""Functions of a profile of the host."""
+PROFILED_EDGE = 100
+"""Largest cube of voxels whose weights are built three times."""
+SLOWEST = 5
+"""Kernels that the profiler looks at."""
+
+
+@dataclass
+class Findings:
+    """What a stage found. Each figure is written at once: a stage that is stopped loses none."""
+
+    path: Path
+    stage: str
+    figures: dict[str, Any] = field(default_factory=dict)
+    failures: list[str] = field(default_factory=list)
+
+    def add(self, name: str, value: Any) -> None:
+        """Add a figure, or what several figures of one name are."""
+        self.figures[name] = value
+        print(f"{name}: {json.dumps(value, default=float)[:1500]}", flush=True)
+        self.write("running")
+
+    def require(self, good: bool, message: str) -> None:
+        """Note a failure unless the result is right."""
+        if not good:
+            self.failures.append(message)
+            print(f"FAILED {message}", flush=True)
+            self.write("running")
+
+    def write(self, status: str) -> None:
+        """Write the file anew, whole."""
+        text = {"stage": self.stage, "status": status, "failures": self.failures, "figures": self.figures}
+        part = self.path.with_suffix(".part")
+        part.write_text(json.dumps(text, indent=1, default=float))
+        part.replace(self.path)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a stage is given."""
+
+    found: Findings
+    scale: str
+    deadline: float
+    """Of `time.monotonic` [s]."""
+    sample: Path | None = None
+    """Folder of the sample data; None where it is not at hand."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the results."""
+        return self.found.path.parent
+
+    @property
+    def left(self) -> float:
+        """Time that is left [s]."""
+        return max(self.deadline - time.monotonic(), 1.0)
+
+    def text(self, name: str) -> Path:
+        """Return the file of what a command says."""
+        return self.folder / f"{self.found.stage}-{name}.txt"
+
+
+def device() -> str:
+    """Return the kind of device of the stages."""
+    return "cpu" if os.environ.get("LFPIV_EMULATE_GPU") else "cuda"
+
+
+def command(job: Job, name: str, *arguments: str, **environment: str) -> tuple[int, float, str]:
+    """Run a command until the stage's time is over; return its exit status, its time [s] and what it said.
+
+    A variable of the environment that is given as "" is removed.
+    """
+    began, path = time.perf_counter(), job.text(name)
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    given = {name: value for name, value in (os.environ | {"PYTHONPATH": paths} | environment).items() if value}
+    with path.open("w") as said:
+        process = subprocess.Popen(arguments, cwd=ROOT, env=given, stdout=said, stderr=said)
+        try:
+            status = process.wait(job.left)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)  # pytest then says what failed so far
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(20)
+            process.kill()
+            status = 124
+    return status, time.perf_counter() - began, path.read_text("utf-8", "replace")
+
+
+def run_tests(job: Job, name: str, *arguments: str) -> None:
+    """Run tests on the device in several processes, and note which of them failed."""
+    processes = str(max((os.cpu_count() or 4) - 3, 1)) if device() == "cuda" else "2"
+    where = ["--device", "cuda"] if device() == "cuda" else ["--emulate-gpu"]
+    options = ["-q", "-n", processes, "-rfE", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow"]
+    status, seconds, said = command(job, name, sys.executable, "-m", "pytest", *options, *where, *arguments)
+    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)(?: - (.*))?$", said, re.MULTILINE)
+    last = next((line for line in reversed(said.splitlines()) if re.search(r"\d+ (passed|failed|error)", line)), "")
+    job.found.add(
+        name, {"status": status, "seconds": seconds, "summary": last, "failed": [list(one) for one in failed]}
+    )
+    job.found.require(status == 0, f"{name}: {last or said[-300:]}")
+
+
+def kernels(job: Job) -> None:
+    """Run the tests of kernels, weights, reconstruction and velocity on the device."""
+    from lfpiv_kernels import runtime
+
+    runtime.start(device())
+    job.found.add("modules", load_modules())
+    small = ("tests/kernels/test_blur.py", "tests/kernels/test_voxels.py")
+    run_tests(job, "tests", *(TESTS if job.scale == "paper" else small))
+
+
+def load_modules() -> dict[str, float]:
+    """Compile every module of Warp for the device, and return the time of each [s]."""
+    import importlib
+    import pkgutil
+
+    import gpu_static
+    import warp as wp
+
+    import lfpiv_kernels
+    from lfpiv_kernels import runtime
+
+    seconds = {}
+    for found in pkgutil.walk_packages(lfpiv_kernels.__path__, "lfpiv_kernels."):
+        importlib.import_module(found.name)
+        short, module = found.name.rpartition(".")[2], wp.get_module(found.name)
+        if module.kernels and (short not in gpu_static.CPU_MODULES or device() == "cpu"):
+            began = time.perf_counter()
+            try:
+                module.load(wp.get_device(runtime.device().warp))
+                seconds[short] = time.perf_counter() - began
+            except Exception as error:  # the other modules are compiled all the same
+                seconds[short] = -1.0
+                print(f"{found.name}: {error}", flush=True)
+    return seconds
+
+
+def taichi(job: Job) -> None:
+    """Run Taichi's kernels: the mapping's tests, and its cases and counts of rays with their times."""
+    small = ("tests/calibration/test_network.py",)
+    run_tests(job, "tests", *(TAICHI_TESTS if job.scale == "paper" else small), "-k", "not weights or count_kernel")
+    names = ("mapping", "count") if job.scale == "small" else ("mapping", "count", "train")
+    cases(job, *(f"{name}_small" for name in names))
+    if job.scale == "paper":
+        cases(job, "mapping_paper", "count_paper")
+
+
+def cases(job: Job, *names: str) -> None:
+    """Run cases of the benchmark and add their figures."""
+    where = "cuda" if device() == "cuda" else "cpu"
+    arguments = [one for name in names for one in ("--case", name)]
+    _, _, said = command(job, names[0], sys.executable, str(ROOT / "perf/run.py"), "--device", where, *arguments)
+    lines = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    for name in names:
+        figures = {line["metric"]: line["value"] for line in lines if line.get("case") == name and "metric" in line}
+        job.found.add(name, figures)
+        job.found.require("wall" in figures, f"{name}: {figures.get('wrong', said[-600:])}")
+
+
+def job_of_users(job: Job) -> None:
+    """Run the demo and the sample data on the device and on the CPU, and compare vectors and times."""
+    scratch = job.folder.parent / "gpu-scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    experiments = {"demo": scratch / "scene" / "experiment.toml"}
+    simulation = (sys.executable, "-m", "lfpiv", "simulate", str(ROOT / "lfpiv/cli/demo_scene.toml"), "--out")
+    status, _, said = command(job, "simulate", *simulation, str(experiments["demo"].parent))
+    job.found.require(status == 0, f"simulate: {said[-600:]}")
+    if job.sample is not None:
+        experiments["sample"] = job.sample / "experiment.toml"
+    elif job.scale == "paper":
+        job.found.require(False, "the sample data are not at hand: --sample FOLDER")
+    for name, experiment in experiments.items():
+        places = {}
+        for kind in ("cuda", "cpu"):
+            emulated = {"LFPIV_EMULATE_GPU": "1" if kind == "cuda" else ""} if device() == "cpu" else {}
+            out = scratch / f"{name}-{kind}"
+            where = device() if kind == "cuda" else "cpu"
+            run = (sys.executable, "-m", "lfpiv", "run", str(experiment), "--out", str(out), "--device", where)
+            status, seconds, said = command(job, f"{name}-{kind}", *run, **emulated)
+            job.found.add(f"{name} {kind}", {"status": status, "seconds": seconds, "said": said[-1500:]})
+            job.found.require(status == 0, f"{name} on {kind}: {said[-600:]}")
+            if (out / "summary.json").exists():
+                places[kind] = out
+                job.found.add(
+                    f"{name} {kind} summary", stages_of(json.loads((out / "summary.json").read_text("utf-8")))
+                )
+        if len(places) == 2:
+            found = difference(*places.values())
+            job.found.add(f"{name} vectors, cuda - cpu", found)
+            job.found.require(found["rms_voxel"] < VECTORS_VOXEL, f"{name}: vectors differ by {found}")
+    shutil.rmtree(scratch, ignore_errors=True)
+
+
+def stages_of(summary: dict[str, Any]) -> dict[str, Any]:
+    """Return what a summary says of times and the device."""
+    return {name: value for name, value in summary.items() if re.search("second|time|device|memory|valid", name)}
+
+
+def difference(first: Path, second: Path) -> dict[str, float]:
+    """Return how far the vectors of two runs are apart [voxel]."""
+    import lfpiv
+
+    with lfpiv.open_results(first) as one, lfpiv.open_results(second) as other:
+        apart = [np.asarray(one[f"displacement_{axis}"] - other[f"displacement_{axis}"]) for axis in "xyz"]
+        both = np.asarray(one["valid"].astype(bool) & other["valid"].astype(bool))
+        share = float(np.mean(np.asarray(one["valid"] == other["valid"])))
+    length = np.sqrt(sum(part**2 for part in apart))[both]
+    return {
+        "rms_voxel": float(np.sqrt(np.mean(length**2))),
+        "median_voxel": float(np.median(length)),
+        "largest_voxel": float(length.max()),
+        "same_validity": share,
+        "vectors": int(length.size),
+    }
+
+
+class Memory:
+    """Free memory of the GPU, looked at every few milliseconds: the largest use is what a process needs."""
+
+    def __init__(self) -> None:
+        from lfpiv_kernels import runtime
+
+        self._free, self._ended = runtime.free_bytes, threading.Event()
+        self.at_first = self._free()
+        self.least = self.at_first
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def _look(self) -> None:
+        while not self._ended.wait(0.005):
+            self.least = min(self.least, self._free())
+
+    def __enter__(self) -> Memory:
+        if self.at_first is not None:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+
+    @property
+    def used(self) -> int | None:
+        """Largest memory that was taken [byte]; None on the CPU."""
+        return None if self.at_first is None else self.at_first - self.least
+
+
+def timed(run: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result and the time [s] of a call, all launches included."""
+    import warp as wp
+
+    wp.synchronize()
+    began = time.perf_counter()
+    result = run()
+    wp.synchronize()
+    return result, time.perf_counter() - began
+
+
+def profiled(run: Callable[[], Any]) -> list[str]:
+    """Return the functions in which a call spends most of its time: number of calls, own and whole time [s], name."""
+    import cProfile
+    import pstats
+
+    profiler = cProfile.Profile()
+    profiler.runcall(run)
+    found = pstats.Stats(profiler).get_stats_profile().func_profiles
+    longest = sorted(found.items(), key=lambda one: -one[1].tottime)[:PROFILED]
+    whole = sorted(found.items(), key=lambda one: -one[1].cumtime)[:PROFILED]
+    return [
+        f"{of.ncalls} {of.tottime:.3f} {of.cumtime:.3f} {Path(of.file_name).name}:{of.line_number} {name}"
+        for name, of in (*longest, *whole)
+    ]
+
+
+@contextlib.contextmanager
+def activities() -> Iterator[dict[str, list[float]]]:
+    """Collect the times of launches and copies on the GPU [ms], by their names."""
+    import warp as wp
+
+    times: dict[str, list[float]] = {}
+    if device() != "cuda":
+        yield times
+        return
+    wp.timing_begin(cuda_filter=wp.TIMING_ALL)
+    try:
+        yield times
+    finally:
+        for one in wp.timing_end():
+            times.setdefault(re.sub(r"_[0-9a-f]{8}\b", "", one.name), []).append(one.elapsed)
+
+
+def rows(times: dict[str, list[float]]) -> dict[str, dict[str, float]]:
+    """Return number, total and median time [ms] of each kind of activity, the longest total first."""
+    ordered = sorted(times.items(), key=lambda item: -sum(item[1]))
+    return {
+        name: {"count": len(of), "total_ms": sum(of), "median_ms": float(np.median(of)), "largest_ms": max(of)}
+        for name, of in ordered
+    }
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two volumes of particles of a rig, their images, and the weights."""
+
+    weights: Any
+    images: tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
+
+    @cached_property
+    def solver(self) -> Any:
+        """The solver, which prepares once what all frames share."""
+        from lfpiv.reconstruction.settings import SmartSettings
+        from lfpiv.reconstruction.solver import SmartSolver
+
+        return SmartSolver(self.weights, SmartSettings())
+
+    def volumes(self) -> list[Any]:
+        """Reconstruct both."""
+        return [self.solver.solve(images).to_dataarray() for images in self.images]
+
+    def vectors(self, volumes: list[Any]) -> Any:
+        """Correlate them."""
+        import lfpiv
+
+        return lfpiv.correlate(*volumes, dt_s=1.0)
+
+
+def make_pair(edge: int, sensor: tuple[int, int], found: Findings) -> Pair:
+    """Build the weights of a cube of voxels and project two volumes of particles."""
+    import inputs
+    from work import SHIFT, particles
+
+    import lfpiv
+
+    calibration, voxels = inputs.rig(sensor), inputs.grid({"voxels": edge})
+    if device() == "cuda":
+        from lfpiv.weights.checks import estimate_device_need
+
+        need = estimate_device_need(calibration, voxels)
+        found.add("memory foreseen [byte]", {"weights": need.weights, "whole": need.whole, "least": need.least})
+    weights, seconds = timed(lambda: lfpiv.build_weights(calibration, voxels))
+    found.add("weights [s]", seconds)
+    if edge <= PROFILED_EDGE and found.stage == "paper":
+        found.add("where the weights' time goes", profiled(lambda: lfpiv.build_weights(calibration, voxels)))
+        found.add("weights again [s]", timed(lambda: lfpiv.build_weights(calibration, voxels))[1])
+    found.add("weights stored [byte]", weights.memory_bytes)
+    shape, rng = weights.grid.shape, np.random.default_rng(2)
+    frames = []
+    for shift in (0.0, SHIFT):
+        images, seconds = timed(lambda shift=shift: weights(2e4 * particles(shape, shift)))
+        frames.append({name: (one + rng.normal(0, 3, one.shape)).astype(np.float32) for name, one in images.items()})
+    found.add("projection with copies of the weights [s]", seconds)
+    return Pair(weights, tuple(frames))
+
+
+def measure_pair(job: Job, pair: Pair, pairs: int) -> Any:
+    """Time a first pair, then several in a row; count copies, launches and memory; return the vectors."""
+    from work import SHIFT
+
+    from lfpiv_kernels.transfer import count_transfers
+
+    found = job.found
+    with Memory() as memory:
+        volumes, seconds = timed(pair.volumes)
+        found.add("first two volumes [s]", seconds)
+        vectors, seconds = timed(lambda: pair.vectors(volumes))
+        found.add("first vectors [s]", seconds)
+        with count_transfers() as moved, activities() as times:
+            volumes, seconds = timed(pair.volumes)
+        found.add("two volumes, timed launches [s]", seconds)
+        found.add("activities of two volumes", rows(times))
+        passes = [len(one.attrs["misfit"]) for one in volumes]
+        copies = {"to device": len(moved.to_device), "to host": len(moved.to_host), "passes": passes}
+        copies |= {"byte to device": sum(moved.to_device), "byte to host": sum(moved.to_host)}
+        found.add("copies of two volumes", copies)
+        with count_transfers() as moved, activities() as times:
+            vectors, seconds = timed(lambda: pair.vectors(volumes))
+        found.add("vectors, timed launches [s]", seconds)
+        found.add("activities of the vectors", rows(times))
+        found.add("copies of the vectors", {"byte to device": sum(moved.to_device), "byte to host": sum(moved.to_host)})
+        found.add("where the host's time goes", profiled(lambda: pair.vectors(pair.volumes())))
+        ours = [timed(pair.volumes)[1] for _ in range(3)], [timed(lambda: pair.vectors(volumes))[1] for _ in range(3)]
+        found.add("two volumes [s]", min(ours[0]))
+        found.add("vectors [s]", min(ours[1]))
+        done, began = 0, time.perf_counter()
+        while done < pairs and job.left > 60:
+            pair.vectors(pair.volumes())
+            done += 1
+        if done:
+            found.add("pairs in a row", {"pairs": done, "seconds per pair": (time.perf_counter() - began) / done})
+    found.add("memory taken after the weights were built [byte]", memory.used)
+    error = [float(abs(np.median(vectors[f"displacement_{a}"]) - s)) for a, s in zip("zyx", SHIFT, strict=True)]
+    found.add("error of the median displacement (z, y, x) [voxel]", error)
+    found.require(max(error) < 0.1, f"a median displacement off by {error} voxel")
+    return vectors
+
+
+def paper(job: Job) -> None:
+    """Measure a pair of the published size, 20 pairs in a row, and the count of its rays."""
+    import cases as benchmark
+
+    from lfpiv_kernels import runtime
+
+    runtime.start(device())
+    of = benchmark.SCALES[job.scale]
+    pair = make_pair(of["voxels"], of["sensor"], job.found)
+    measure_pair(job, pair, PAIRS if job.scale == "paper" else 1)
+
+
+def large(job: Job) -> None:
+    """Measure pairs of 300^3 and 500^3 voxels, each in a process of its own."""
+    for edge in (300, 500) if job.scale == "paper" else (24, 28):
+        done, seconds, said = command(
+            job, str(edge), sys.executable, __file__, "cube", str(job.folder), "--scale", job.scale,
+            "--edge", str(edge), "--minutes", f"{(job.left - 10) / 60:.2f}",
+        )  # fmt: skip
+        if (path := job.folder / "cube.json").exists():
+            part = json.loads(path.read_text())
+            job.found.add(f"{edge}", part["figures"] | {"failures": part["failures"]})
+            path.unlink()
+        job.found.require(done == 0, f"{edge}^3: exit status {done} after {seconds:.0f} s: {said[-600:]}")
+
+
+def cube(job: Job, edge: int) -> None:
+    """Measure a pair of a cube of voxels, with a sensor just large enough."""
+    from lfpiv_kernels import runtime
+
+    runtime.start(device())
+    sensor = (round(20.5 * edge) + 64, round(28 * edge) + 104)
+    measure_pair(job, make_pair(edge, sensor, job.found), 0)
+
+
+def limits(job: Job) -> None:
+    """Measure the bandwidth of the memory and of the bus, the time of a launch, and the cases of the kernels."""
+    import warp as wp
+
+    from lfpiv_kernels import runtime
+
+    running = runtime.start(device())
+    place, size = running.warp, COPIED[job.scale]
+    first, second = (wp.zeros(size, dtype=float, device=place) for _ in range(2))
+    seconds = [timed(lambda: wp.copy(second, first))[1] for _ in range(REPEATS)]
+    job.found.add("device", running.figures())
+    job.found.add("bandwidth [byte/s]", 8 * size / float(np.min(seconds)))
+    host = wp.zeros(size // 4, dtype=float, device="cpu", pinned=device() == "cuda")
+    part = first[: size // 4]
+    for name, (to, source) in {"to device": (part, host), "to host": (host, part)}.items():
+        best = min(timed(lambda to=to, source=source: wp.copy(to, source))[1] for _ in range(REPEATS))
+        job.found.add(f"bus, page-locked, {name} [byte/s]", size / best)
+    short = wp.zeros(32, dtype=float, device=place)
+    began = timed(lambda: [short.zero_() for _ in range(1000)])[1]
+    job.found.add("a launch [s]", began / 1000)
+    del part
+    names = ["project", "back_project", "smart", "correlate_8", "deform", "vectors", "footprint", "smart_subsets"]
+    import cases as benchmark
+
+    scale = "small" if job.scale == "small" else "medium"
+    known = [f"{name}_{scale}" for name in names if f"{name}_{scale}" in benchmark.CASES]
+    cases(job, *(known if job.scale == "paper" else known[:1]))
+
+
+def profile(job: Job) -> None:
+    """Look at the slowest kernels by Nsight Compute, and at a small pair by compute-sanitizer."""
+    slowest = slowest_kernels(job.folder / "paper.json")
+    ncu, sanitizer = shutil.which("ncu"), shutil.which("compute-sanitizer")
+    job.found.add("kernels looked at", slowest)
+    script = (sys.executable, __file__, "launch", str(job.folder), "--scale")
+    sections = ("SpeedOfLight", "MemoryWorkloadAnalysis", "Occupancy", "WarpStateStats", "LaunchStats")
+    if ncu:
+        options = [ncu, "--clock-control", "none", "--target-processes", "all", "--csv", "--page", "details"]
+        options += [one for name in sections for one in ("--section", name)]
+        for kernel in slowest:
+            few = ["--kernel-name", f"regex:{kernel}", "--launch-skip", "6", "--launch-count", "2"]
+            status, seconds, said = command(job, f"ncu{kernel}", *options, *few, *script, job.scale)
+            job.found.add(f"ncu {kernel}", {"status": status, "seconds": seconds} | counters(said))
+            job.found.require(status == 0, f"ncu {kernel}: {said[-300:]}")
+    else:
+        job.found.add("ncu", "not installed")
+    for tool in ("memcheck", "racecheck"):
+        if not sanitizer:
+            job.found.add("compute-sanitizer", "not installed")
+            break
+        status, seconds, said = command(
+            job, tool, sanitizer, "--tool", tool, "--error-exitcode", "9", "--print-limit", "20", *script, "small"
+        )
+        job.found.add(tool, {"status": status, "seconds": seconds, "said": said[-1500:]})
+        job.found.require(status == 0, f"{tool}: {said[-600:]}")
+
+
+def slowest_kernels(path: Path) -> list[str]:
+    """Return the kernels that take most of a pair's time, by the figures of the stage `paper`; a guess without them."""
+    found: dict[str, float] = {}
+    if path.exists():
+        figures = json.loads(path.read_text())["figures"]
+        for part in ("activities of two volumes", "activities of the vectors"):
+            for name, row in figures.get(part, {}).items():
+                if name.startswith("forward kernel "):
+                    found[name.removeprefix("forward kernel ")] = row["total_ms"]
+    return sorted(found, key=lambda name: -found[name])[:SLOWEST] or ["_scatter", "_gather"]
+
+
+def counters(said: str) -> dict[str, Any]:
+    """Return the metrics that Nsight Compute prints as CSV, by name; of several launches the last."""
+    import csv
+
+    lines = [line for line in said.splitlines() if line.startswith('"')]
+    return {
+        f"{row['Metric Name']} [{row['Metric Unit']}]": row["Metric Value"]
+        for row in csv.DictReader(lines)
+        if row.get("Metric Name")
+    }
+
+
+def launch(job: Job) -> None:
+    """Reconstruct and correlate a pair once, for the profiler."""
+    import cases as benchmark
+
+    from lfpiv_kernels import runtime
+
+    runtime.start(device())
+    of = TINY if job.scale == "tiny" else benchmark.SCALES[job.scale]
+    pair = make_pair(of["voxels"], of["sensor"], job.found)
+    pair.vectors(pair.volumes())
+
+
+def threads(job: Job) -> None:
+    """Reconstruct on the CPU with more and more threads: a frame of 64^3 voxels."""
+    for count in (1, 2, 4, 8, os.cpu_count() or 1) if job.scale == "paper" else (1, 2):
+        done, seconds, said = command(
+            job, str(count), sys.executable, __file__, "frame", str(job.folder), "--edge", str(count), "--scale",
+            "medium" if job.scale == "paper" else "small", LFPIV_EMULATE_GPU="",
+        )  # fmt: skip
+        if (path := job.folder / "frame.json").exists():
+            job.found.add(f"{count} threads", json.loads(path.read_text())["figures"])
+            path.unlink()
+        job.found.require(done == 0, f"{count} threads: exit status {done} after {seconds:.0f} s: {said[-600:]}")
+
+
+def frame(job: Job, count: int) -> None:
+    """Reconstruct a frame on some threads of the CPU."""
+    import cases as benchmark
+
+    from lfpiv_kernels import runtime
+
+    runtime.start("cpu", threads=count)
+    of = benchmark.SCALES[job.scale]
+    pair = make_pair(of["voxels"], of["sensor"], job.found)
+    pair.solver.solve(pair.images[0])
+    job.found.add("a frame [s]", min(timed(lambda: pair.solver.solve(pair.images[1]))[1] for _ in range(2)))
+
+
+STAGES: dict[str, Callable[[Job], None]] = {
+    "limits": limits, "kernels": kernels, "job": job_of_users, "paper": paper, "large": large, "profile": profile,
+    "taichi": taichi, "threads": threads,
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stage", choices=[*STAGES, "cube", "frame", "launch"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--scale", choices=("tiny", "small", "medium", "paper"), default="paper")
+    parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--sample", type=Path, help="folder with the sample experiment")
+    parser.add_argument("--edge", type=int, default=32, help="voxels of the edge of `cube`")
+    given = parser.parse_args()
+    found = Findings(given.folder / f"{given.stage}.json", given.stage)
+    job = Job(found, given.scale, time.monotonic() + 60 * given.minutes, given.sample)
+    more = {
+        "cube": lambda job: cube(job, given.edge), "frame": lambda job: frame(job, given.edge), "launch": launch,
+    }  # fmt: skip
+    try:
+        (STAGES | more)[given.stage](job)
+    except Exception as error:
+        traceback.print_exc()
+        found.failures.append(f"{type(error).__name__}: {error}")
+    found.write("failed" if found.failures else "passed")
+    return int(bool(found.failures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

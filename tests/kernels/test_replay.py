@@ -1,0 +1,40 @@
+"""Launches that are recorded and replayed on a GPU."""
+
+import numpy as np
+import pytest
+
+from lfpiv_kernels.reconstruction.sums import Totals
+from lfpiv_kernels.reconstruction.voxels import multiply
+from lfpiv_kernels.replay import Replay
+from lfpiv_kernels.transfer import to_device, to_host
+
+SIZE = 5000
+ROUNDING = 1e-5  # relative: sums of 5,000 squares in float64, of numbers in float32
+
+
+@pytest.fixture
+def numbers(device):
+    return np.random.default_rng(5).uniform(0.5, 1.5, (4, SIZE)).astype(np.float32)
+
+
+def test_each_call_works_on_its_own_input(numbers):
+    factor = to_device(numbers[0], float)
+    replay = Replay(lambda given, found: multiply(given, factor, found))
+    for given in (*numbers, *numbers):
+        assert (to_host(replay(to_device(given.copy(), float))) == given * numbers[0]).all()
+
+
+def test_sums_outside_go_on_from_call_to_call(numbers):
+    """A replay adds to the same totals, and memory that the work takes for itself can be taken again."""
+    one, totals = to_device(np.ones(SIZE, np.float32), float), Totals(1)
+
+    def work(given, found):
+        multiply(given, one, found)
+        totals.add_squares(0, one, found)
+
+    replay = Replay(work)
+    for _ in range(2):
+        totals.clear()
+        for given in numbers:
+            replay(to_device(given.copy(), float))
+        assert totals.read()[0] == pytest.approx((numbers.astype(float) ** 2).sum(), rel=ROUNDING)
