@@ -1,7 +1,7 @@
 """Explain why a text is not TOML: its line, what is wrong there, and what to write instead.
 
-Each rule proposes another line for a frequent mistake. Its explanation is given only if that line is TOML, so that no
-guess is wrong; otherwise the message says what the parser expected.
+Each rule mends a frequent mistake by a pattern. It is told only if the mended line is TOML, so that no guess is wrong.
+Otherwise the message says what the parser expected.
 """
 
 from __future__ import annotations
@@ -9,10 +9,8 @@ from __future__ import annotations
 import re
 import sys
 import unicodedata
-from collections.abc import Callable, Iterator
-
-from lfpiv.experiment import toml_values
-from lfpiv.experiment.toml_values import Mistake
+from collections.abc import Callable
+from dataclasses import dataclass
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -24,15 +22,9 @@ SHOWN_LINE = 80
 LONGEST_LINE = 2000
 """Longest line that the rules look at [character]."""
 
-INVISIBLE = re.compile("[\u200b\u200c\u200d\u2060\ufeff]")
-"""Characters of no width, which text copied from pages holds."""
-BLANKS = re.compile("[\u00a0\u2007\u202f\u3000]")
-"""Blanks other than those of TOML."""
-
 _PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _STATEMENT = re.compile(r"(?P<key>\s*[\w.-]+\s*)=(?P<value>.*)")
 _HEADER = re.compile(r"\s*(?P<open>(?:\[\s*)+)(?P<name>[\w.-]+)(?P<close>(?:\s*\])*)\s*(?P<rest>.*)")
-_STRING = re.compile(r'"[^"]*"')
 
 _PLAIN = {
     "Invalid value": "expected a number, text in quotes, true, false, or a list in brackets after =",
@@ -60,7 +52,7 @@ def explain(text: str, error: tomllib.TOMLDecodeError) -> str:
     Returns
     -------
     str
-        "line 7, `voxel_mm = 0,7`: expected a point in a decimal number, found a comma. Write 0.7."
+        "line 7, `voxel_mm = 0,7`: expected a point in a decimal number, found a comma. Write `voxel_mm = 0.7`."
     """
     said, (number, column) = _PLACE.sub("", str(error)), _place(text, str(error))
     lines = text.splitlines() or [""]
@@ -76,9 +68,8 @@ def explain(text: str, error: tomllib.TOMLDecodeError) -> str:
     line = lines[number]
     if len(line) <= LONGEST_LINE and not _parses(line):
         for rule in _RULES:
-            for mistake in rule(line):
-                if mistake.mended != line and _parses(mistake.mended):
-                    return f"{_line(lines, number)}: expected {mistake.expected}, found {mistake.found}. {mistake.way}"
+            if advice := rule.advice(line):
+                return f"{_line(lines, number)}: {advice}"
     return f"{_line(lines, number)}: {_in_general(said, line, column)}"
 
 
@@ -92,9 +83,13 @@ def _place(text: str, message: str) -> tuple[int, int]:
 
 
 def _line(lines: list[str], number: int) -> str:
-    shown = lines[number].strip()
-    shown = shown if len(shown) <= SHOWN_LINE else shown[: SHOWN_LINE - 3] + "..."
-    return f"line {number + 1}, `{shown}`" if shown else f"line {number + 1}, which is empty"
+    shown = _shown(lines[number])
+    return f"line {number + 1}, {shown}" if shown != "``" else f"line {number + 1}, which is empty"
+
+
+def _shown(line: str) -> str:
+    text = line.strip()
+    return f"`{text if len(text) <= SHOWN_LINE else text[: SHOWN_LINE - 3] + '...'}`"
 
 
 def _parses(text: str) -> bool:
@@ -171,66 +166,135 @@ def _twice(lines: list[str], number: int) -> str:
 
 # -- rules for one line ------------------------------------------------------------------------------------------------
 
-
-def _unseen(line: str) -> Iterator[Mistake]:
-    """Propose the line without characters that look like a blank or like nothing."""
-    for pattern, new, way in ((BLANKS, " ", "Replace it by a blank."), (INVISIBLE, "", "Delete it.")):
-        if match := pattern.search(line):
-            name = f"{unicodedata.name(match[0])} in place {match.start() + 1}"
-            yield Mistake("visible characters and plain blanks", name, way, pattern.sub(new, line))
+New = str | Callable[[re.Match[str]], str]
+"""What takes the place of a match: a template, or what it returns."""
 
 
-def _backslash(line: str) -> Iterator[Mistake]:
-    """Propose / in a path of Windows in double quotes."""
-    first = next((text for text in _STRING.findall(line) if "\\" in text), None)
-    if first is not None:
-        slashes = _STRING.sub(lambda text: text[0].replace("\\", "/"), line)
-        single = "" if "'" in first else f", or single quotes: '{first[1:-1]}'"
-        found = "a backslash in double quotes, which begins a special character"
-        yield Mistake("a path without backslashes", found, f"Use /: {first.replace(chr(92), '/')}{single}.", slashes)
+@dataclass(frozen=True)
+class _Rule:
+    """A mistake of one line, and what may have been meant."""
+
+    pattern: str
+    expected: str
+    found: str
+    """A template of the match; empty for its character that is not ASCII."""
+    meant: tuple[New, ...]
+    way: str = ""
+    """What to do where no line can be proposed."""
+
+    def advice(self, line: str) -> str:
+        """Return what was expected, what was found and what to write; "" if the line has not this mistake."""
+        match = re.search(self.pattern, line)
+        if match is None:
+            return ""
+        lines = dict.fromkeys(re.sub(self.pattern, new, line) for new in self.meant)
+        mended = [one for one in lines if one != line and _parses(one)]
+        if not mended:
+            return ""
+        strange = next((one for one in match[0] if ord(one) > 127), " ")
+        found = match.expand(self.found) or f"{strange!r} ({unicodedata.name(strange, 'without a name')})"
+        way = self.way or f"Write {', or '.join(map(_shown, mended))}."
+        return f"expected {self.expected}, found {found}. {way}"
 
 
-def _comment(line: str) -> Iterator[Mistake]:
-    """Propose # before a comment of another language."""
-    match = re.fullmatch(r"(.*?(?:^|\s))(//|%|;|--|!|/\*)\s*([^=]*\S)\s*", line)
-    if match:
-        yield Mistake("# before a comment", match[2], f"Write # {match[3]}", f"{match[1]}# {match[3]}")
+def _without(pattern: str, new: str = "") -> Callable[[re.Match[str]], str]:
+    """Replace a pattern in the value of a match of `_KEY` and `_END`."""
+    return lambda match: match[1] + re.sub(pattern, new, match[2]) + match[match.re.groups]
 
 
-def _equals(line: str) -> Iterator[Mistake]:
-    """Propose = between key and value, and a key without blanks."""
-    match = re.fullmatch(r"(\s*[\w-]+)\s*(:=|==|=>|:)\s*(\S.*)", line)
-    if match:
-        yield Mistake("= between key and value", match[2], "Write key = value.", f"{match[1]} = {match[3]}")
-    match = re.fullmatch(r"\s*(\w+(?:\s+\w+)+)\s*=(.*)", line)
-    if match:
-        key = "_".join(match[1].split())
-        yield Mistake("a key without blanks", repr(match[1]), f"Is it {key}?", f"{key} ={match[2]}")
-    match = re.fullmatch(r"(\s*[\w-]+)\s+([^\s=].*)", line)
-    if match:
-        yield Mistake("= between key and value", "none", "Write key = value.", f"{match[1]} = {match[2]}")
+def _quoted(match: re.Match[str]) -> str:
+    """Put quotes around what is no number in a list."""
+    parts = (part.strip() for part in match[2].split(","))
+    listed = ", ".join(part if _parses(f"a = {part}") else f'"{part}"' for part in parts)
+    return f"{match[1]}[{listed}]{match[3]}"
 
 
-def _brackets(line: str) -> Iterator[Mistake]:
-    """Propose a table where its brackets do not match."""
-    match = _HEADER.fullmatch(line)
-    if match is None or (match["rest"] and match["rest"][0] not in "#]"):
-        return
-    once, twice = f"[{match['name']}]", f"[[{match['name']}]]"
-    found = re.sub(r"\s*#.*", "", line).strip()
-    way = f"Write {once}, or {twice} for tables of which there are several, such as cameras."
-    yield Mistake("the name of a table in one pair of brackets, or in two", found, way, once)
+def _plain_numbers(match: re.Match[str]) -> str:
+    text = re.sub(r"(?<![\d.])\.(?=\d)", "0.", match[2])
+    text = re.sub(r"(?<=\d)\.(?!\d)", ".0", text)
+    return match[1] + re.sub(r"(?<![\d.])0+(?=\d)", "", text) + match[3]
 
 
-def _value(line: str) -> Iterator[Mistake]:
-    """Propose a value in TOML's form."""
-    match = _STATEMENT.fullmatch(line)
-    if match is None:
-        return
-    key, text = match["key"], match["value"]
-    bare = text if any(quote in text for quote in "\"'") else text.partition("#")[0]
-    for mistake in toml_values.mistakes(bare.strip(), key.strip()):
-        yield Mistake(mistake.expected, mistake.found, mistake.way, f"{key}= {mistake.mended}")
+def _value(value: str, *rest: str | tuple[New, ...]) -> _Rule:
+    """Return a rule for the value of a key; in it group 1 is all before the value, the last group all after it."""
+    return _Rule(rf"^(\s*[\w.-]+\s*=\s*){value}(\s*(?:#.*)?)$", *rest)  # type: ignore[arg-type]
 
 
-_RULES: tuple[Callable[[str], Iterator[Mistake]], ...] = (_unseen, _backslash, _brackets, _comment, _value, _equals)
+_UNIT = r"\s*([A-Za-z\u00b0\u00b5\u03bc%][\w/^%-]*)"
+_NUMBER = r"[+-]?\d[\d.,]*(?:[eE][+-]?\d+)?"
+_UNITLESS = "Write the number alone, in the unit that the key states; other text needs quotes."
+_RULES = (
+    _Rule("[\u00a0\u2007\u202f\u3000]", "plain blanks", "", (" ",)),
+    _Rule("[\u200b\u200c\u200d\u2060\ufeff]", "visible characters", "", ("",)),
+    _Rule("[\u201c\u201d\u201e\u201f\u00ab\u00bb\u2033]", "straight quotes", "", ('"',)),
+    _Rule("[\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u201b\u2039\u203a\u00b4]", "straight quotes", "", ('"',)),
+    _Rule("[\u2010-\u2014\u2212]", "a plain minus sign", "", ("-",)),
+    _Rule(
+        r'"[^"]*\\[^"]*"',
+        "a path without backslashes",
+        "a backslash in double quotes, which begins a special character",
+        (lambda match: match[0].replace("\\", "/"), lambda match: f"'{match[0][1:-1]}'"),
+    ),
+    _Rule(
+        r"^\s*(\[+\s*([\w.-]+)[\s\]]*)(#.*)?$",
+        "the name of a table in one pair of brackets, or in two where there are several, such as cameras",
+        r"\1",
+        (r"[\2]", r"[[\2]]"),
+    ),
+    _Rule(r"(^|\s)(//|%|;|--|!|/\*)\s*([^=]*\S)\s*$", "# before a comment", r"\2", (r"\1# \3",)),
+    _value(r"([({])(.*)[)}]", "a list in square brackets", r"\2", (r"\1[\3]\4",)),
+    _value(
+        r"\[([^\]]*;[^\]]*)\]",
+        "commas between the values of a list",
+        "semicolons",
+        (lambda match: f"{match[1]}[{match[2].replace(',', '.').replace(';', ',')}]{match[3]}",),
+    ),
+    _value(
+        r"\[([^\],]*)\]",
+        "commas between the values of a list",
+        "blanks",
+        (lambda match: f"{match[1]}[{', '.join(match[2].split())}]{match[3]}",),
+    ),
+    _value(r"(\[[^\]]*\])\s*([^\s#].*?)", "a list alone", r"'\3' after it", (r"\1\2\4",)),
+    _value(r"(\[[^\]#]*)", "a closing bracket ] after the list", "none", (r"\1\2]\3",)),
+    _value(r"([+-]?\d{1,3}([ '\u2019.])\d{3}(?:\3\d{3})*)", "a number without separators", r"\2", (_without(r"\D"),)),
+    _value(r"(\d{1,3}(?:,\d{3}){2,})", "a number without separators", r"\2", (_without(","), r"\1[\2]\3")),
+    _value(r"(\d{1,3},\d{3})", "a point in a decimal number", "a comma", (_without(",", "."), _without(","))),
+    _value(r"([+-]?\d+,\d+)", "a point in a decimal number", "a comma", (_without(",", "."), r"\1[\2]\3")),
+    _value(r"([^\[\](){}\"'#=]*,[^\[\](){}\"'#=]*?)", "a list in brackets", "none", (r"\1[\2]\3",)),
+    _value(
+        rf"(\(?{_NUMBER}(?:\s*[*/^]+\s*\(?{_NUMBER}\)?)+)",
+        "one number",
+        r"the calculation \2",
+        ("a = 1",),
+        "Write its result.",
+    ),
+    _value(rf"({_NUMBER}){_UNIT}", "a number alone", r"'\3' after it", ("a = 1",), _UNITLESS),
+    _value(rf"\[([^\]\"']*?\d{_UNIT}[^\]\"']*)\]", "a number alone", r"'\3' after it", ("a = 1",), _UNITLESS),
+    _value(r"([^\"'#A-Za-z]+?)", "digits before and after the point, and no leading zeros", r"\2", (_plain_numbers,)),
+    _value(
+        r"([tT]rue|TRUE|[fF]alse|FALSE)", "true or false in small letters", r"\2", (lambda match: match[0].lower(),)
+    ),
+    _value(r"((?i:yes|no|on|off))", "true or false", r"\2", ("a = 1",), "Write one of them; text needs quotes."),
+    _value(
+        r"((?i:none|null|nil))", "a value", r"\2", ("a = 1",), "Leave the key out to state none; text needs quotes."
+    ),
+    _value(r"(.*?)\s*([;,])", "the end of the line after the value", r"\3", (r"\1\2\4",)),
+    _value(
+        r"((?=[^#]*[A-Za-z])[^\s\"'\[\],#=(][^\"'\[\],#=]*?)",
+        "a number, or text in quotes",
+        r"\2",
+        (lambda match: f'{match[1]}"{match[2]}"'.replace("\\", "/") + match[3],),
+    ),
+    _value(r"\[([^\]\"'{}]*[A-Za-z][^\]\"'{}]*)\]", "text in quotes", r"\2", (_quoted,)),
+    _value(r"((\"|')[^\"']*)", r"a closing quote after the text", "none", (r"\1\2\3\4",)),
+    _value(r"([^\"']*(\"|'))", r"an opening quote before the text", "none", (r"\1\3\2\4",)),
+    _Rule(r"^(\s*[\w-]+)\s*(:=|==|=>|:)\s*(\S.*)$", "= between key and value", r"\2", (r"\1 = \3",)),
+    _Rule(
+        r"^\s*(\w+(?:\s+\w+)+)\s*=",
+        "a key without blanks",
+        r"'\1'",
+        (lambda match: f"{'_'.join(match[1].split())} =",),
+    ),
+    _Rule(r"^(\s*[\w-]+)\s+([^\s=].*)$", "= between key and value", "none", (r"\1 = \2",)),
+)
