@@ -1,6 +1,6 @@
 """Answer a run at once where nothing changed since the same command finished: keep results, summary and report.
 
-A finished run leaves a record of its command, of this program, and of size and times of all files that it read and
+A finished run leaves a digest of its command, of this program, and of size and times of all files that it read and
 wrote. The same command looks at these files and opens none of them. If one differs, the run checks settings, images and
 results as ever: it compares contents, verifies digests and repeats what does not fit.
 
@@ -55,13 +55,10 @@ class Command:
 class _Record:
     """What is known of a run that finished."""
 
-    command: dict[str, Any]
-    places: tuple[str, str]
-    """Absolute paths of the experiment file and of the folder: a copy of the folder has another one."""
-    program: str
-    """Digest of version and files of this program."""
-    files: dict[str, State]
-    """Path -> state, of all files that were read or written."""
+    stamp: str
+    """Digest of command, places, program, and the states of the files."""
+    files: tuple[str, ...]
+    """Paths of all files that were read or written."""
     reused: tuple[str, ...]
     """Names of the results."""
 
@@ -77,25 +74,22 @@ def repeat(command: Command, out: str | Path) -> dict[str, Any] | None:
         If the summary cannot be written.
     """
     start, folder = time.perf_counter(), Folder(Path(out))
-    record = _read(folder.record)
-    if record is None or (record.command, record.places) != (_plain(command), _places(command, folder)):
-        return None
-    if record.program != program():
-        return None
-    with folder.held():
-        if any(state_of(path) != state for path, state in record.files.items()):
+    try:
+        known = validate(_Record, read_object(read_text(folder.record)))
+        if len(known.files) > MOST_FILES:
             return None
-        try:
+        with folder.held():
+            if known != _record_of(command, folder, {path: state_of(path) for path in known.files}, known.reused):
+                return None
             summary = read_object(read_text(folder.summary))
-        except (FileNotFoundError, RecordError):
-            return None
-        log.info("nothing changed since the same command finished: results and report are kept")
-        summary["reused"] = list(record.reused)
-        summary["timings_s"] |= {"total": time.perf_counter() - start}
-        written = summary_file.write(summary, folder.summary)
-        known = {**record.files, str(folder.summary.absolute()): state_of(folder.summary)}
-        _write(_Record(**(vars(record) | {"files": known})), folder.record)
-        return written
+            log.info("nothing changed since the same command finished: results and report are kept")
+            summary["reused"] = list(known.reused)
+            summary["timings_s"] |= {"total": time.perf_counter() - start}
+            written = summary_file.write(summary, folder.summary)
+            _write(_record_of(command, folder, {path: state_of(path) for path in known.files}, known.reused), folder)
+            return written
+    except (FileNotFoundError, RecordError):
+        return None
 
 
 def look_at(experiment: Experiment) -> dict[str, State]:
@@ -132,14 +126,7 @@ def record(
     first, after = command.pairs or (0, None)
     numbers = [pair for pair in experiment.numbers if first <= pair and (after is None or pair < after)]
     reused = ("calibration", *(f"vectors of {experiment.name_of(pair)}" for pair in numbers))
-    found = _Record(
-        command=_plain(command),
-        places=_places(command, folder),
-        program=program(),
-        files={**read, **written},
-        reused=reused,
-    )
-    _write(found, folder.record)
+    _write(_record_of(command, folder, {**read, **written}, reused), folder)
 
 
 def state_of(path: str | Path) -> State:
@@ -185,27 +172,13 @@ def _written_files(folder: Folder) -> Iterable[Path]:
     return [*single, *(path for place in places for path in sorted(place.glob("*.nc")))]
 
 
-def _plain(command: Command) -> dict[str, Any]:
-    found: dict[str, Any] = files.plain(asdict(command))
-    return found
+def _record_of(command: Command, folder: Folder, states: Mapping[str, State], reused: tuple[str, ...]) -> _Record:
+    """Return the record of a run; of a copy of the folder it is another one."""
+    places = os.path.abspath(command.experiment), os.path.abspath(folder.path)
+    known = [asdict(command), places, program(), list(states.items()), reused]
+    return _Record(stamp=digest({"known": files.plain(known)}), files=tuple(states), reused=reused)
 
 
-def _places(command: Command, folder: Folder) -> tuple[str, str]:
-    return os.path.abspath(command.experiment), os.path.abspath(folder.path)
-
-
-def _read(path: Path) -> _Record | None:
-    """Read a record; None if it is missing, damaged or of another version."""
-    try:
-        content = read_object(read_text(path))
-        if content.get("digest") != digest(content):
-            return None
-        return validate(_Record, content)
-    except (FileNotFoundError, RecordError):
-        return None
-
-
-def _write(found: _Record, path: Path) -> None:
-    content = files.plain(vars(found))
-    with writing(path):
-        files.write_json({**content, "digest": digest(content)}, path)
+def _write(found: _Record, folder: Folder) -> None:
+    with writing(folder.record):
+        files.write_json(vars(found), folder.record)
