@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "notebook").glob("*.md")))
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in FILES}
+TEXTS = {name: page.read_text("utf-8") for name, page in PAGES.items()}
 NOTEBOOK = {name: page for name, page in PAGES.items() if name.startswith("docs/notebook/")}
 SCRIPTS = sorted((DOCS / "gallery").glob("plot_*.py"))
 SOURCES = {
@@ -134,17 +135,17 @@ def test_commands_are_understood_and_quick_ones_succeed(reader, tables, name, ca
         assert not run or commands.call(words) == 0, (words, capfd.readouterr().err)
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_named_commands_and_options_exist(tables, name):
+def test_named_commands_and_options_exist(tables):
     known = tables.commands()
     groups = {command.split()[0] for command in known if " " in command}
-    for spoken in re.findall(r"`lfpiv ([a-z][^`]*)`", PAGES[name].read_text("utf-8")):
+    spoken_of = {(name, one) for name, text in TEXTS.items() for one in re.findall(r"`lfpiv ([a-z][^`]*)`", text)}
+    for name, spoken in sorted(spoken_of):
         if spoken in groups:
             continue
         command, rest = command_in(spoken.split(), known)
-        assert command in known, spoken
+        assert command in known, (name, spoken)
         options = {option for parameter in known[command].params for option in parameter.opts} | {"--help"}
-        assert {word for word in rest if word.startswith("--")} <= options, spoken
+        assert {word for word in rest if word.startswith("--")} <= options, (name, spoken)
 
 
 ALTERNATIVES = {"nominal_direction", "instants", "first", "step"}
@@ -156,9 +157,8 @@ def uncommented(text):
     return re.sub(r"^# (\w+ = |\[\[)", r"\1", text, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_experiment_files_are_valid_with_their_optional_keys(name):
-    for language, text, _ in blocks(PAGES[name]):
+def test_experiment_files_are_valid_with_their_optional_keys():
+    for language, text, _ in (block for page in FILES for block in blocks(page)):
         if language != "toml":
             continue
         for version in (text, uncommented(text)):
@@ -297,23 +297,25 @@ def slugs(page):
     )
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_links_lead_somewhere(name):
-    page = PAGES[name]
-    text = re.sub(r"`[^`\n]*`", "", page.read_text("utf-8"))
-    entries = re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-    targets = [line for entry in entries for line in entry.split("\n") if line and not line.startswith(":")]
+def links(text):
+    """Targets of a page's links, and of its lists of pages."""
+    entries = re.findall(r"^```\{toctree\}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    yield from (f"{line}.md" for entry in entries for line in entry.split("\n") if line and not line.startswith(":"))
+    yield from re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", text))
+
+
+def test_links_lead_somewhere():
     made = {f"generated/gallery/images/sphx_glr_{script.stem}" for script in SCRIPTS} | {"generated/gallery/index"}
-    for target in [t + ".md" for t in targets] + re.findall(r"\]\(([^)\s]+)\)", text):
+    for page, target in [(one, target) for one in FILES for target in links(one.read_text("utf-8"))]:
         if re.match(r"[a-z]+:", target):
             continue
         file, _, anchor = target.partition("#")
         if file.startswith("generated/"):
-            assert re.sub(r"(_\d{3}\.png|\.rst|\.md)$", "", file) in made, target
+            assert re.sub(r"(_\d{3}\.png|\.rst|\.md)$", "", file) in made, (page, target)
             continue
         path = page.parent / file if file else page
-        assert path.exists() or any(path.parent.glob(path.name)), target
-        assert not anchor or anchor in slugs(path), target
+        assert path.exists() or any(path.parent.glob(path.name)), (page, target)
+        assert not anchor or anchor in slugs(path), (page, target)
 
 
 def test_scripts_use_names_that_exist():
@@ -391,14 +393,14 @@ def test_names_of_modules_and_their_constants_exist():
     assert not wrong
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_named_source_files_exist(name):
+def test_named_source_files_exist():
     """Paths start at the root or, in short, inside `lfpiv`; a bare name lies beside the path before it in the text."""
     folders = (ROOT, ROOT / "lfpiv", DOCS)
-    for part in re.split(r"\n\n|\n(?=\|)", prose(PAGES[name].read_text("utf-8"))):
+    parts = ((name, part) for name, text in TEXTS.items() for part in re.split(r"\n\n|\n(?=\|)", prose(text)))
+    for name, part in parts:
         for path in re.findall(r"`([\w./]+\.(?:py|h)|(?:lfpiv\w*|tests|perf|docs)/[\w/]*)`", part):
             found = [folder / path for folder in folders if (folder / path).exists()]
-            assert found, path
+            assert found, (name, path)
             folders = (*folders[:3], found[0] if found[0].is_dir() else found[0].parent)
         folders = folders[:3]
 
