@@ -24,9 +24,6 @@ from lfpiv.simulation.scene import Scene
 ROOT = "base"
 """Name of the case that all others start from."""
 
-VARIED = ("base", "seeding", "cameras", "images", "flow", "sequence", "size")
-"""What cases vary, in the order of lists."""
-
 CaseName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9.-]{0,39}$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 

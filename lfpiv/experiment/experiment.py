@@ -276,10 +276,6 @@ class Experiment(Shown):
         number = f"pair {pair}, frame {frame!r}" if self.series is None else f"instant {self.instant(pair, frame)}"
         return f"particles.images, camera {name!r}, {number}"
 
-    def calibration_paths(self) -> list[Path]:
-        """Return the paths of all images that the calibration reads, in a fixed order."""
-        return [image.path for image in self.calibration_images()]
-
     def calibration_images(self, cameras: Sequence[CameraSetup] | None = None) -> list[ImagePath]:
         """Return all images that the calibration reads, in a fixed order; `cameras` are all unless some are given."""
         cameras = self.cameras if cameras is None else cameras
@@ -313,14 +309,6 @@ class Experiment(Shown):
     def pair_images(self, pair: int) -> list[ImagePath]:
         """Return all images of one pair, in a fixed order."""
         return [image for frame in self.pair_frames(pair) for image in self.frame_images(frame)]
-
-    def pair_paths(self, pair: int) -> list[Path]:
-        """Return the paths of all images of one pair, in a fixed order."""
-        return [path for frame in self.pair_frames(pair) for path in self.frame_paths(frame)]
-
-    def frame_paths(self, frame: Frame) -> list[Path]:
-        """Return the paths of the images of one frame, in the order of the cameras."""
-        return [self.particle_path(camera.name, *frame) for camera in self.cameras]
 
 
 def read_image_of(path: Path, label: str, camera: CameraSetup) -> np.ndarray:

@@ -61,11 +61,6 @@ class Missing:
             return range(0)
         return range(max(self.end.start - (0 if series is None else series.step), pairs.start), pairs.stop)
 
-    @property
-    def pairs_in_gaps(self) -> int:
-        """Number of pairs, or instants, of `gaps`."""
-        return sum(map(len, self.gaps))
-
     def message(self) -> str:
         """Return key, pattern, stated and found numbers, which are missing, and what to do."""
         experiment, noun = self.experiment, self.experiment.noun

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -48,14 +46,6 @@ def plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e6e9ec", linewidth=0.6)
     axes.set_axisbelow(True)
-
-
-def plain_log(axis: Axis, values: Iterable[float]) -> None:
-    """Mark the values that a logarithmic axis (`Axes.xaxis`, `Axes.yaxis`) reaches, as plain numbers."""
-    low, high = sorted(axis.get_view_interval())
-    shown = [value for value in values if low <= value <= high]
-    axis.set_ticks(shown, [f"{value:.3g}" for value in shown])
-    axis.set_ticks([], minor=True)
 
 
 def draw_slice(axes: Axes, volume: xr.DataArray, voxels: int, title: str) -> None:

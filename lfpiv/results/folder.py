@@ -75,11 +75,6 @@ class Folder:
         return self.path / "guard.json"
 
     @property
-    def counts(self) -> Path:
-        """Parts of counted weights, until all voxels are counted."""
-        return self.path / ".counts"
-
-    @property
     def bootstrap(self) -> Path:
         """Damping by ghosts, measured in simulated pairs."""
         return self.path / "bootstrap.json"

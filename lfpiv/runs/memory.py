@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
 import os
 import sys
@@ -15,12 +14,10 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import LEAST_BYTES_PER_CAMERA, LEAST_BYTES_PER_VOXEL
 from lfpiv.experiment.segments import REACH
-from lfpiv.files import MIB, size_text
+from lfpiv.files import MIB
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
-
-log = logging.getLogger(__name__)
 
 GIB = 1 << 30
 
@@ -51,18 +48,10 @@ OWN_GROUPS = Path("/proc/self/cgroup")
 
 
 def weights_bytes(experiment: Experiment, particle_voxel: float = 0.0) -> int:
-    """Estimate the memory of the weights [byte] from the nominal rig, for particles of a size if it is known.
-
-    Logs the upper limit if the form of the weights is chosen later.
-    """
+    """Estimate the memory of the weights [byte] from the nominal rig, for particles of a size if it is known."""
     from lfpiv.weights.checks import estimate_memory
 
-    cameras, grid, form = nominal_cameras(experiment), experiment.grid, weights_form(experiment)
-    weights = estimate_memory(cameras, grid, form, particle_voxel)
-    if form == "auto" and (most := estimate_memory(cameras, grid, "pixels", particle_voxel)) > weights:
-        text = "memory: weights need %s, at most %s with strong aberrations"
-        log.info(text, size_text(weights), size_text(most))
-    return weights
+    return estimate_memory(nominal_cameras(experiment), experiment.grid, weights_form(experiment), particle_voxel)
 
 
 def weights_form(experiment: Experiment) -> str:

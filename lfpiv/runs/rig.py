@@ -230,7 +230,6 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
             form=compute.weights_form,
             particle_voxel=run.particle_voxel,
             rays=compute.count_rays,
-            finished=run.folder.counts if compute.weights == "count" else None,
             limit_bytes=memory.left_for_weights(finest),
             progress=run.step("weights"),
         )

@@ -1,23 +1,17 @@
 """Weights of a whole grid by counting rays (Eq. 10), as blocks of 8-bit levels.
 
-Every voxel is counted by ``lfpiv_kernels.rays.counted_blocks`` in batches of planes, whose blocks are joined. A batch
-may be kept in a file until all are counted, so that a count that was killed goes on where it was.
+Every voxel is counted by ``lfpiv_kernels.rays.counted_blocks`` in batches of planes, whose blocks are joined.
 """
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import zipfile
 from collections.abc import Callable, Iterator
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lfpiv.files import replacing, writing
 from lfpiv.lightfield.microimage_layout import whole_microimages
 from lfpiv.progress import StepProgress
 from lfpiv.weights.blocks import BLOCK_BYTES, SAMPLED_VOXELS, VOXEL_BYTES, Growing, PackedCamera, require_numbers
@@ -31,12 +25,8 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, pack_optics
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-log = logging.getLogger(__name__)
-
 BATCH_VOXELS = 16384
 """Number of voxels in a batch, at least a plane of them."""
-FORM = 1
-"""Form of the files of batches, and of the counts in them. Raise it when either changes."""
 NAMES = ("blocks", "values", "even_blocks", "even_values", "scale", "ray", "height", "width", "value")
 """Arrays of a batch, as `CountedBlocks.compute` yields them."""
 
@@ -64,7 +54,6 @@ def count_blocks(
     rays: int,
     progress: StepProgress,
     allow: Callable[[int], None],
-    finished: Path | None = None,
 ) -> Blocks:
     """Count the rays of every voxel of a grid on one camera.
 
@@ -80,15 +69,11 @@ def count_blocks(
         Called with the finished fraction after each batch.
     allow : callable
         Called with the estimated memory of the blocks [byte] before they are counted; may raise.
-    finished : Path, optional
-        Folder for finished batches. Those that fit are read instead of counted again.
 
     Raises
     ------
     InputError
         If there are more blocks than 32-bit indices can number, before they are counted.
-    StorageError
-        If a batch cannot be written.
     """
     counter, microimages = counter_of(camera, rays)
     blocks, values = _sample(counter, stored, camera)
@@ -101,7 +86,7 @@ def count_blocks(
     per_voxel: list[Batch] = []
     first = 0
     for model in _model_batches(stored, camera):
-        batch = _count_batch(counter, model, first, finished)
+        batch = _joined(counter.compute(model, first))
         for name, array in joined.items():
             part = batch.pop(name)
             array.take(len(part))[:] = part
@@ -148,25 +133,3 @@ def _model_batches(stored: StoredGrid, camera: CalibratedCamera) -> Iterator[np.
 
 def _joined(parts: Iterator[tuple[np.ndarray, ...]]) -> Batch:
     return {name: np.concatenate(arrays) for name, arrays in zip(NAMES, zip(*parts, strict=True), strict=True)}
-
-
-def _count_batch(counter: CountedBlocks, model: np.ndarray, first: int, finished: Path | None) -> Batch:
-    """Count a batch, or read it if it was counted before: its file is named by all that the counts depend on."""
-    if finished is None:
-        return _joined(counter.compute(model, first))
-    known = hashlib.blake2b(f"{FORM} {first} {counter.constants()}".encode(), digest_size=16)
-    known.update(model.tobytes())
-    path = finished / f"{known.hexdigest()}.npz"
-    try:
-        with np.load(path, allow_pickle=False) as stored:  # verifies check sums
-            return {name: stored[name] for name in NAMES}
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        log.info("%s: a batch of counted voxels cannot be used (%s); it is counted again", path, error)
-    batch = _joined(counter.compute(model, first))
-    with writing(path):
-        finished.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as scratch, scratch.open("wb") as file:
-            np.savez(file, allow_pickle=False, **batch)
-    return batch

@@ -195,12 +195,6 @@ def _overlap(shape: tuple[int, ...], window: tuple[int, ...], corner: np.ndarray
     return (rows, columns), within
 
 
-def add_window(image: np.ndarray, window: np.ndarray, corner: np.ndarray) -> None:
-    """Add a window whose first pixel is `corner` (column, row) to a sensor image, in place."""
-    on_sensor, in_window = _overlap(image.shape, window.shape, corner)
-    image[on_sensor] += window[in_window]
-
-
 def _window(image: np.ndarray, corner: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Cut a window out of a sensor image; zero outside it."""
     out = np.zeros(shape, image.dtype)

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
 from collections.abc import Hashable, Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -332,7 +330,6 @@ def build_weights(
     planes: bool = True,
     particle_voxel: float = 0.0,
     rays: int = DEFAULTS.count_rays,
-    finished: Path | None = None,
     limit_bytes: float = math.inf,
     progress: StepProgress | None = None,
 ) -> Weights:
@@ -360,9 +357,6 @@ def build_weights(
         the grid's axes have planes.
     rays : int
         Rays that are counted per voxel and camera, one of ``compute.count_rays``.
-    finished : Path, optional
-        Folder in which parts of a count are kept until all voxels are counted, so that a count that was killed goes on
-        where it was. It is removed at the end.
     limit_bytes : float
         Memory that the weights may take [byte]; default: no limit.
     progress : callable, optional
@@ -379,8 +373,6 @@ def build_weights(
     InputError
         If the weights would not fit into `limit_bytes`, raised before they are computed. If volumes and images leave no
         memory of the GPU for streamed weights.
-    StorageError
-        If parts of a count cannot be written to `finished`.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")
@@ -410,15 +402,13 @@ def build_weights(
         step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
         if method == "count":
             allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
-            projectors[name] = share.projector(name, count_blocks(stored, camera, rays, step, allow, finished))
+            projectors[name] = share.projector(name, count_blocks(stored, camera, rays, step, allow))
             continue
         chosen = choices[name]
         allow = memory_check(name, grid, chosen, limit_bytes - used)
         nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel) if planes else None
         blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
         projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)
-    if finished is not None:
-        shutil.rmtree(finished, ignore_errors=True)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     log.info("weights: %d voxels, %d cameras, %s", grid.size, len(cameras), size_text(weights.memory_bytes))
     return weights

@@ -258,11 +258,6 @@ class CountedBlocks:
         self._room = list(FIRST_ROOM)
         self._scratch = {}
 
-    def constants(self):
-        """Return all that counts depend on besides the ray models, as text."""
-        numbers = *self._camera.to_list(), *self._lattice.to_list(), *self._first, *self._last, self._rays
-        return " ".join(map(repr, map(float, numbers))) + f" {self._hexagonal}"
-
     def reach(self, model):
         """Return the lowest and the highest lens (i, j) that the rays of each voxel can meet, shapes (voxel, 2)."""
         radius = self._radius

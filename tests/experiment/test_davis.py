@@ -10,7 +10,6 @@ import pytest
 
 import lfpiv
 from lfpiv.experiment import images
-from lfpiv.experiment.readers.source import split
 from lfpiv.results import stamps
 
 PAIRS_RECORDED = 50
@@ -138,7 +137,7 @@ def test_an_experiment_of_buffers_opens(lvpyio, recorded):
     np.testing.assert_array_equal(
         experiment.particle_image("1", last, "0"), lvpyio[f"B{last:05d}"][2].components["PIXEL"].planes[0]
     )
-    hashes = {stamps.content_hash([split(path)]) for pair in range(2) for path in experiment.pair_paths(pair)}
+    hashes = {stamps.content_hash([image]) for pair in range(2) for image in experiment.pair_images(pair)}
     assert len(hashes) == 8
 
 

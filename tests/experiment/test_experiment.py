@@ -31,7 +31,7 @@ def test_experiment_says_what_its_file_says(tiny_experiment):
     assert experiment.frames == ("a", "b") and experiment.pairs == 2
     assert experiment.dark("left") is None and experiment.dark("right").shape == (56, 40)
     assert experiment.smart == Smart() and experiment.network == Network() and experiment.compute == Compute()
-    assert len(experiment.calibration_paths()) == 3 + 4 and len(experiment.pair_paths(1)) == 4
+    assert len(experiment.calibration_images()) == 3 + 4 and len(experiment.pair_images(1)) == 4
 
 
 @pytest.mark.sample_data

@@ -33,7 +33,7 @@ def test_pairs_of_a_series_have_the_number_of_their_first_instant(tiny_series):
     experiment = open_experiment(tiny_series)
     assert experiment.series == Series(instants=4, first=7, step=1)
     assert experiment.numbers == range(7, 10) and experiment.pairs == 3
-    names = [[path.name for path in experiment.pair_paths(pair)] for pair in experiment.numbers]
+    names = [[image.path.name for image in experiment.pair_images(pair)] for pair in experiment.numbers]
     assert names[0] == ["left_007.tif", "right_007.tif", "left_008.tif", "right_008.tif"]
     assert names[2][2] == "left_010.tif"
     assert set(experiment.spread_pairs(2)) <= set(experiment.numbers)

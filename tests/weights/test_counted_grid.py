@@ -19,7 +19,6 @@ from lfpiv.weights import counted_grid
 from lfpiv.weights.counted_grid import counter_of
 from lfpiv.weights.counting import count_voxels
 from lfpiv.weights.ray_fit import ray_models
-from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.rays import counted_blocks
 
@@ -201,40 +200,9 @@ def test_several_threads_count():
     assert int(done.stdout.split()[-1]) > 1  # on one core a thread may take the part of another one, too
 
 
-def test_a_killed_count_goes_on_at_its_last_finished_batch(monkeypatch, tmp_path):
-    monkeypatch.setattr(counted_grid, "BATCH_VOXELS", 1)  # a plane
-    planes = StoredGrid.for_cameras(GRID, [RIGS["square"]]).shape[0]
-    expected, folder = count(rays=1024), tmp_path / "counts"
-
-    def killed(fraction):
-        if fraction > 0.5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        count(rays=1024, finished=folder, progress=killed)
-    kept = sorted(folder.iterdir())
-    assert 0 < len(kept) < planes
-    kept[0].write_bytes(kept[0].read_bytes()[:-200])  # damaged: counted again
-    counted, compute = [], counted_blocks.CountedBlocks.compute
-    monkeypatch.setattr(
-        counted_blocks.CountedBlocks, "compute", lambda self, *given: (counted.append(given), compute(self, *given))[1]
-    )
-    fractions = []
-    assert same(count(rays=1024, finished=folder, progress=fractions.append), expected)
-    assert len(counted) == 1 + planes - (len(kept) - 1)  # the sample of voxels, and the batches without a sound file
-    assert fractions == sorted(fractions) and fractions[-1] == 1.0
-    assert not folder.exists()
-    with pytest.raises(KeyboardInterrupt):
-        count(rays=1024, finished=folder, progress=killed)
-    counted.clear()
-    count(rays=2048, finished=folder)  # other rays: nothing fits
-    assert len(counted) == 1 + planes and not folder.exists()
-
-
-def test_too_large_weights_are_refused_before_they_are_counted(tmp_path):
+def test_too_large_weights_are_refused_before_they_are_counted():
     with pytest.raises(InputError, match=r"weights of 4 x 3 x 5 voxels .* need .* GiB as pixels"):
-        count(rays=1024, limit_bytes=1000, finished=tmp_path / "counts")
-    assert not (tmp_path / "counts").exists()
+        count(rays=1024, limit_bytes=1000)
     with pytest.raises(ValueError, match=r"rays: expected a power of 2 from 16 to 131072, got 4093\."):
         count(rays=4093)
 
@@ -261,7 +229,7 @@ def test_a_run_with_counted_weights_measures_the_same_vectors(small_run, tmp_pat
     experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
     experiment.write_text(experiment.read_text() + '\n[compute]\nweights = "count"\n')
     summary = pipeline.run(experiment, out, device=device.kind)
-    assert summary["weights"]["method"] == "count" and not (out / ".counts").exists()
+    assert summary["weights"]["method"] == "count"
     assert 0.1 < np.mean(summary["weights"]["count_check_l2"]) < NOISE[4096]
     apart = []
     for path in sorted((out / "vectors").iterdir()):
