@@ -266,7 +266,8 @@ def _log_series(experiment: Experiment, name: str, light: StandingLight, count: 
         images = f"{frames} of {images}"
     parts = [f"light stands still in {100 * light.region.mean():.2g} % of the sensor"] if light.region.any() else []
     parts += [f"stray light of {light.stray:.2g} counts lies on all pixels"] if light.stray > LEAST_STRAY else []
-    parts += [f"{np.count_nonzero(light.unusable)} pixels saturate in it"] if light.unusable.any() else []
+    if light.unusable.any():
+        parts.append(f"{np.count_nonzero(light.unusable)} pixels saturate or repeat one count, and are left out")
     log.info("background of %s, estimated from %s and subtracted: %s", name, images, "; ".join(parts))
 
 

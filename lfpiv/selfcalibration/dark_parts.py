@@ -8,7 +8,7 @@ sensor is the measure of chance: it grows where particles are few or unequal.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,10 +51,14 @@ class _Cells:
     """Cells of one camera's sensor, within the region that sees the volume."""
 
     def __init__(self, weights: Weights, name: str):
-        self.camera = name
-        optics = weights.cameras[name].optics
+        self.camera, camera = name, weights.cameras[name]
+        self.weights = weights.of_camera(name)
+        self.weights.cameras[name] = replace(camera, standing=None)  # a part that repeats one count is unusable, too
+        optics, usable = camera.optics, camera.white_gain > 0
+        if camera.standing is not None:
+            usable &= ~(camera.standing.unusable & camera.standing.region)
         pixels = weights.projector(name).map.pixel
-        self._pixels = np.unique(pixels[weights.gain(name).ravel()[pixels] > 0])
+        self._pixels = np.unique(pixels[usable.ravel()[pixels]])
         places = np.stack(np.divmod(self._pixels, optics.sensor_shape[1]))
         low, extent = places.min(1, keepdims=True), np.ptp(places, 1, keepdims=True) + 1
         counts = np.clip(extent / (PART_LENSES * optics.microimage_pitch_px), 1, CELLS).astype(int)
@@ -64,6 +68,10 @@ class _Cells:
         self._edges = [
             start + np.arange(n + 1) * size // n for start, size, n in np.column_stack((low, extent, counts)).tolist()
         ]
+
+    def projected(self, volume: np.ndarray) -> np.ndarray:
+        """Return the light that a volume projects into each cell, shape (row, column)."""
+        return self.light(self.weights(volume)[self.camera])
 
     def light(self, image: np.ndarray) -> np.ndarray:
         """Return the light in each cell, shape (row, column)."""
@@ -130,15 +138,14 @@ def find(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[DarkPart]:
         for name in solvers if number else cells:
             seen[name] = seen[name] + sum(cells[name].light(images[name]) for images in pair)
         if not number:
-            even = weights(np.ones(weights.grid.shape, np.float32))
-            dark = [name for name, one in cells.items() if one.darkest(seen[name], one.light(even[name]))]
+            even = np.ones(weights.grid.shape, np.float32)
+            dark = [name for name, one in cells.items() if one.darkest(seen[name], one.projected(even))]
             settings = SmartSettings(iterations=ITERATIONS, **PLAIN)
             solvers = {name: SmartSolver(weights.without(name), settings) for name in dark}
         for name, solver in solvers.items():
-            projected = weights.of_camera(name)
             for images in pair:
                 volume = solver.solve({other: images[other] for other in solver.weights.cameras}).volume
-                expected[name] = expected[name] + cells[name].light(projected(volume)[name])
+                expected[name] = expected[name] + cells[name].projected(volume)
         found = [part for name in solvers if (part := cells[name].darkest(seen[name], expected[name]))]
         clear = [part for part in found if part.lack > CLEAR and _stands_out(part, found)]
         if clear or not any(STANDS_OUT * part.lack > CLEAR for part in found):

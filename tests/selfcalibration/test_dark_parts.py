@@ -1,11 +1,15 @@
 """Parts of a sensor that are dark although the other cameras see particles there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import lfpiv
+from lfpiv.lightfield.standing_light import nothing
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.selfcalibration.dark_parts import find
+from lfpiv.weights.operator import Weights
 
 WIDER = 1.5
 """Width of a volume that particles do not fill, over their own."""
@@ -54,6 +58,16 @@ def test_a_dark_third_of_a_sensor_is_found(weights, pairs, name, part, rows, col
     assert found.camera == name
     for (first, last), (low, high) in ((found.rows, rows), (found.columns, columns)):
         assert low - cell < first < last < high + cell and last - first > 2 * cell
+
+
+def test_a_part_that_repeats_one_count_is_dark_although_its_pixels_count_as_unusable(weights, pairs):
+    part, camera = np.s_[:, 267:], weights.cameras["left"]
+    unusable = np.zeros(camera.optics.sensor_shape, bool)
+    unusable[part] = True
+    standing = replace(nothing(camera.decoder), unusable=unusable, found=True)
+    cameras = {**weights.cameras, "left": camera.with_standing(standing)}
+    stuck = Weights(weights.stored, cameras, {name: weights.projector(name) for name in cameras}, weights.method)
+    assert [one.camera for one in find(stuck, darkened(pairs, "left", part))] == ["left"]
 
 
 def test_sound_images_have_no_dark_part_even_in_a_volume_that_they_do_not_fill(rig, weights, pairs):
