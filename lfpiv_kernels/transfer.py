@@ -19,6 +19,9 @@ from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
 
+MOST_ELEMENTS = 2**31 - 1
+"""Largest number of elements of an array of Warp."""
+
 if TYPE_CHECKING:
     DeviceArray: TypeAlias = wp.array[Any, Any]
 else:
@@ -65,6 +68,27 @@ def to_device(values: Values, dtype: type | None = None, device: str | None = No
             counted.to_device.append(values.nbytes)
     kind = {} if dtype is None else {"dtype": dtype}
     return wp.array(values, device=device or runtime.device().warp, copy=moved, **kind)
+
+
+def bytes_on_device(values: np.ndarray, device: str | None = None) -> wp.array:
+    """Return bytes, shape (byte,), as an array on a device, as `to_device` does, but any number of them.
+
+    Warp knows of the first `MOST_ELEMENTS`. Kernels that take the array's address find the others behind these.
+    """
+    if values.size <= MOST_ELEMENTS:
+        return to_device(values, device=device)
+    whole = values[: values.size // 8 * 8].view(np.uint64)
+    held: tuple[wp.array, ...] = (to_device(whole, device=device),)
+    if device is None and runtime.device().form == "gpu":  # the last bytes fill no word
+        last = np.zeros(8, np.uint8)
+        last[: values.size % 8] = values[whole.nbytes :]
+        words = wp.empty(whole.size + 1, dtype=wp.uint64, device=runtime.device().warp)
+        wp.copy(words, held[0])
+        wp.copy(words, to_device(last.view(np.uint64)), dest_offset=whole.size)
+        held = (words,)
+    first = wp.array(ptr=held[0].ptr, dtype=wp.uint8, shape=(MOST_ELEMENTS,), device=held[0].device)
+    first.held = (*held, values)  # the memory of both must outlive it
+    return first
 
 
 def overwrite(given: Values, found: wp.array) -> None:

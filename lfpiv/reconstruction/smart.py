@@ -62,7 +62,7 @@ class ImageEquations:
         self.comparisons = [Comparison(one.projector, one.image, one.gain, one.floor) for one in self.cameras]
         """The images beside the projections, on the device."""
         self._totals = Totals(2)
-        self._replays: dict[tuple[tuple[int, int], ...], Replay] = {}
+        self._replay = Replay()
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -97,12 +97,11 @@ class ImageEquations:
     def exponent_of(self, parts: Sequence[tuple[int, int]], volume: DeviceArray) -> DeviceArray:
         """Compare a volume with sets of rays, each given by its camera and number, and back-project the logarithms.
 
-        The misfits are added to those since `begin`. The exponent is 0 where `volume` is 0. The next call with the same
-        parts may overwrite it.
+        The misfits are added to those since `begin`. The exponent is 0 where `volume` is 0. The next call may
+        overwrite it.
         """
         if all(camera.projector.takes_rows for camera in self.cameras):  # short launches, nothing streamed
-            replay = self._replays.setdefault(tuple(parts), Replay(partial(self._find_exponent, parts)))
-            return replay(volume)
+            return self._replay(tuple(parts), partial(self._find_exponent, parts), volume)
         exponent = empty(volume.size)
         self._find_exponent(parts, volume, exponent)
         return exponent

@@ -21,7 +21,7 @@ from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
-from lfpiv_kernels.transfer import Given, Values, overwrite, to_device, to_host, zeros
+from lfpiv_kernels.transfer import Given, Values, bytes_on_device, overwrite, to_device, to_host, zeros
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
@@ -165,7 +165,7 @@ class Projector(RayProjector):
         self._matrix = Matrix()
         for name in ("first_block", "first_value", "ray", "height", "width", "scale"):
             setattr(self._matrix, name, to_device(getattr(blocks, name)))
-        self._matrix.level = to_device(blocks.value)
+        self._matrix.level = bytes_on_device(blocks.value)
         for name, ends in (("even_blocks", blocks.first_block), ("even_values", blocks.first_value)):
             array = getattr(blocks, name)
             setattr(self._matrix, name, to_device(np.diff(ends).astype(np.int32) if array is None else array))

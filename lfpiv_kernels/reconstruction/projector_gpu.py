@@ -14,7 +14,7 @@ from lfpiv_kernels import native, runtime
 from lfpiv_kernels.lanes import lanes_of_warp
 from lfpiv_kernels.launch import Call, launch
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
-from lfpiv_kernels.transfer import to_device
+from lfpiv_kernels.transfer import bytes_on_device, to_device
 
 wp.set_module_options(native.options("projector_gpu.h"))
 
@@ -221,7 +221,7 @@ class TiledRays:
         work.profiles, work.sectors = matrix.profiles, matrix.sectors
         for name, array in (arrays | {"ray": blocks.ray}).items():
             setattr(work, name, to_device(array, device="cpu"))
-        inputs = [work, to_device(blocks.value, device="cpu"), self._edge, side]
+        inputs = [work, bytes_on_device(blocks.value, "cpu"), self._edge, side]
         _run_on_host(_count_entries, inputs, [count, tile_set])
         (lit,) = np.nonzero(count)
         first = np.append(0, count[lit].cumsum())
@@ -278,7 +278,7 @@ class TiledProjector(TiledRays):
         for name, array in arrays.items():
             setattr(matrix, name, to_device(array))
         matrix.word = wp.zeros(word_count(matrix, arrays), dtype=wp.uint32, device=runtime.device().warp)
-        values = [to_device(blocks.first_value), to_device(blocks.value)]
+        values = [to_device(blocks.first_value), bytes_on_device(blocks.value)]
         launch(Call(_align, len(blocks.scale), [matrix, *values], [matrix.word]))
         self.matrix = matrix
         """The weights on the device."""
@@ -330,7 +330,7 @@ def align_on_host(matrix: TiledMatrix, arrays: dict[str, np.ndarray], blocks: Bl
     work.profiles, work.sectors = matrix.profiles, matrix.sectors
     for name in ("first_block", "height", "width", "start"):
         setattr(work, name, to_device(arrays[name], device="cpu"))
-    values = [to_device(array, device="cpu") for array in (blocks.first_value, blocks.value)]
+    values = [to_device(blocks.first_value, device="cpu"), bytes_on_device(blocks.value, "cpu")]
     _run_on_host(_align, [work, *values, 0], [word], len(blocks.scale))
     return word
 

@@ -19,9 +19,17 @@ def numbers(device):
 
 def test_each_call_works_on_its_own_input(numbers):
     factor = to_device(numbers[0], float)
-    replay = Replay(lambda given, found: multiply(given, factor, found))
+    replay, works = (
+        Replay(),
+        {
+            "once": lambda given, found: multiply(given, factor, found),
+            "twice": lambda given, found: multiply(given, factor, found, factor=2.0),
+        },
+    )
     for given in (*numbers, *numbers):
-        assert (to_host(replay(to_device(given.copy(), float))) == given * numbers[0]).all()
+        for times, (name, work) in enumerate(works.items(), start=1):
+            found = to_host(replay(name, work, to_device(given.copy(), float)))
+            assert (found == given * numbers[0] * np.float32(times)).all()
 
 
 def test_sums_outside_go_on_from_call_to_call(numbers):
@@ -32,9 +40,9 @@ def test_sums_outside_go_on_from_call_to_call(numbers):
         multiply(given, one, found)
         totals.add_squares(0, one, found)
 
-    replay = Replay(work)
+    replay = Replay()
     for _ in range(2):
         totals.clear()
         for given in numbers:
-            replay(to_device(given.copy(), float))
+            replay("squares", work, to_device(given.copy(), float))
         assert totals.read()[0] == pytest.approx((numbers.astype(float) ** 2).sum(), rel=ROUNDING)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 from lfpiv_kernels import runtime
-from lfpiv_kernels.transfer import count_transfers, to_device, to_host
+from lfpiv_kernels.transfer import bytes_on_device, count_transfers, to_device, to_host
 
 
 @pytest.fixture
@@ -38,3 +39,13 @@ def test_work_of_the_host_moves_nothing(device):
     with count_transfers() as counted:
         to_device(values, float, device="cpu")
     assert counted.to_device == []
+
+
+@pytest.mark.parametrize("size", [7, 1000, 1001, 1007, 4096])
+@pytest.mark.parametrize("place", [None, "cpu"])
+def test_more_bytes_than_warp_can_number_lie_at_the_address_of_their_array(monkeypatch, moves, size, place):
+    monkeypatch.setattr("lfpiv_kernels.transfer.MOST_ELEMENTS", 1000)
+    values = np.random.default_rng(3).integers(0, 256, size).astype(np.uint8)
+    found = bytes_on_device(values, place)
+    whole = wp.array(ptr=found.ptr, dtype=wp.uint8, shape=(size,), device=found.device)
+    assert found.size == min(size, 1000) and (whole.numpy() == values).all()

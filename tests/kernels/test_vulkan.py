@@ -17,7 +17,8 @@ MOVED = 1e-3
 
 def computed(file, arch):
     """Compute the results of all kernels in a process of its own. Skip the test without a driver of Vulkan."""
-    environment = {**os.environ, "LFPIV_TAICHI": arch, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+    paths = [str(ROOT), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "LFPIV_TAICHI": arch, "PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, str(ROOT / "tests" / "support" / "taichi_kernels.py"), str(file)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if "finds no driver" in done.stderr:

@@ -103,6 +103,8 @@ def test_coefficients_of_a_volume_are_found_on_the_device(recorded, moves):
 
 def test_a_step_over_a_subset_launches_few_sweeps_and_reuses_its_memory(recorded, monkeypatch):
     """One sweep scales the exponent, one takes the step with its momentum; one masks the exponent of rows of pixels."""
+    if runtime.device().kind == "cuda":
+        pytest.skip("a replay launches nothing from Python")
     launched, launch = Counter(), wp.launch
 
     def counted(kernel, *arguments, **keywords):
