@@ -9,7 +9,7 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.smart import Misfit
 
 DIVERGENCE = 1.5
-"""Rise of the misfit over its first value that counts as divergence. Smoothing may raise it a little."""
+"""Rise of the misfit over its first value that counts as divergence. A relaxation above 1 may raise it a little."""
 
 
 @dataclass

@@ -51,9 +51,9 @@ def changed_options():
 
 
 @pytest.mark.skipif(shutil.which("clang-format") is None, reason="clang-format is not installed")
-@pytest.mark.parametrize("header", sorted(CHECKOUT.glob("*.h")), ids=lambda path: path.name)
-def test_headers_are_formatted(header):
-    done = subprocess.run(["clang-format", "--dry-run", "--Werror", header], stderr=subprocess.PIPE, text=True)
+def test_headers_are_formatted():
+    headers = sorted(CHECKOUT.glob("*.h"))
+    done = subprocess.run(["clang-format", "--dry-run", "--Werror", *headers], stderr=subprocess.PIPE, text=True)
     assert done.returncode == 0, done.stderr
 
 
