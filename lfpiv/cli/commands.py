@@ -160,9 +160,9 @@ def _plan(
     ] = None,
     device: Device = None,
 ) -> None:
-    """Say what a campaign will take: vectors, time, memory and disk, from a short calibration of this machine.
+    """Say what a campaign will take: vectors, time, memory and disk, scaled from its first pair.
 
-    Nothing is written, and no particle images are needed. The run's own steps are done on parts of the volume.
+    The first pair is done as in a run, in as much time, and nothing is written. No particle images are needed.
     """
     with _output.progress() as progress:
         from lfpiv.planning.campaign import plan

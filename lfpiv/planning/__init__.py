@@ -1,1 +1,1 @@
-"""What a campaign will take, from a short calibration of this machine: time, memory and disk."""
+"""What a campaign will take, scaled from its first pair: time, memory and disk."""

@@ -1,4 +1,4 @@
-"""`plan`: time, memory and disk of a campaign before it begins, from a short calibration of this machine."""
+"""`plan`: time, memory and disk of a campaign before it begins, scaled from its first pair."""
 
 from __future__ import annotations
 
@@ -17,32 +17,25 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.files import size_text
-from lfpiv.planning import preparation
-from lfpiv.planning.cost import NOTHING, Cost, grown, timed
-from lfpiv.planning.part import LEAST_POINT, Form, Measured, Volume, measure
+from lfpiv.planning.cost import NOTHING, Cost
+from lfpiv.planning.first_pair import FirstPair, board_cost, measure
 from lfpiv.planning.result import Disk, Memory, Plan, Time
-from lfpiv.planning.vectors import plan_vectors
-from lfpiv.progress import Progress, StepProgress
-from lfpiv.reconstruction.motion import ITERATION_SHARE
+from lfpiv.progress import Progress
 from lfpiv.reconstruction.refinement import LARGEST
 from lfpiv.runs import device_memory, memory, rig, worker_plan
+from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.run import Run, open_run
 from lfpiv.velocity import vector_grid
-from lfpiv.weights.depth_planes import FEWEST_VOXELS
-from lfpiv.weights.device_share import DeviceNeed, beside_bytes, rays_bytes
+from lfpiv.weights.device_share import rays_bytes
 from lfpiv_kernels import runtime
-from lfpiv_kernels.runtime import Device, cores
+from lfpiv_kernels.runtime import cores
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
 
 log = logging.getLogger(__name__)
 
-SMALL_VOXELS, LARGE_VOXELS = 30_000, 220_000
-"""Reconstructed voxels of the two parts whose costs are extrapolated."""
-COUNTED_VOXELS = 4_000
-"""The same of the larger part where weights are counted, which takes far longer."""
-CALIBRATION = "calibration of this machine"
+FIRST_PAIR = "first pair"
 """Name of the step, for progress."""
 
 
@@ -57,8 +50,8 @@ def plan(
 ) -> Plan:
     """Say what a campaign will take, before it begins.
 
-    The run's own steps are done on two parts of the volume, with the real rig and simulated particles, and their times
-    are extrapolated to the whole. It takes some seconds, and needs no particle images. Nothing is written.
+    The first pair is done as in a run, with simulated particles where its images are not there yet, and its times are
+    scaled. So it takes as long as the weights and one pair. Nothing is written.
 
     Parameters
     ----------
@@ -99,7 +92,7 @@ def plan(
             if workers is None:
                 workers = len(gpus) if len(gpus) > 1 else 1
             with threadpool_limits(1):
-                return _plan(current, experiment, pairs, min(workers, pairs), Path(scratch), out is not None)
+                return _plan(current, pairs, min(workers, pairs), Path(scratch), out is not None)
 
 
 def _whole(name: str, value: object, most: int = 10**9) -> int:
@@ -114,57 +107,38 @@ def _sharing(experiment: Experiment, workers: int) -> Experiment:
     return replace(experiment, compute=experiment.compute.model_copy(update={"threads": threads}))
 
 
-def _plan(run: Run, experiment: Experiment, pairs: int, workers: int, scratch: Path, stored: bool) -> Plan:
-    """Measure and extrapolate. `run` is on the experiment with the threads of one worker."""
-    step, assumptions = run.step(CALIBRATION), list[str]()
+def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Plan:
+    """Measure the first pair and scale it. `run` has the threads of one worker."""
+    step = run.step(FIRST_PAIR)
     step(0.0)
+    experiment, assumptions = run.experiment, list[str]()
     calibration, calibrated = _calibration(run, stored, assumptions)
-    whole = _volume(run, calibration, assumptions)
+    run = _with_voxels(run, assumptions)
+    finest = run.reconstructed_experiment
+    maps = sum(map(rays_bytes, calibration.cameras.values()))
+    estimated = memory.weights_bytes(finest, run.particle_voxel) + maps
+    worker_plan.require_memory(finest, estimated, 1)
+    need = memory_of(run, estimated, workers)
+    if need.device_streamed:
+        assumptions.append("the weights that a pass copies to the GPU are those of this process alone")
     step(0.1)
-    forms, chosen = timed(whole.forms)
-    needed = memory_of(whole, forms, workers, run.device)
-    if needed.device_streamed:
-        assumptions.append("the time in which weights are copied to the GPU in each pass is not in the plan")
-    step(0.2)
-    small, large = _parts(whole, forms, step)
-    step(0.7)
-    light = preparation.read_light(experiment, calibration)
-    if not light.recorded:
-        assumptions.append("particle images are read as fast as the white images: there are none yet")
-    step(0.8)
-    vectors = plan_vectors(whole, whole.per_voxel(), large.volume, scratch)
+    prepared = {} if calibrated else board_cost(experiment, calibration, assumptions)
+    first = measure(run, calibration, scratch, calibrated=calibrated)
     step(0.9)
-    prepared = _prepared(run, whole, calibrated, light.frame, large, assumptions)
-    size = sum(form.stored_bytes for form in forms.values())
-
-    def full(part: str) -> Cost:
-        near, far = ((one.stored_bytes, getattr(one, part)) for one in (small, large))
-        return far[1] if large.voxels == whole.finest.grid.size else grown(near, far, size)
-
-    frame = full("frame")
-    check = large.check * (frame.cpu_s / large.frame.cpu_s) + 2 * light.frame  # both are SMART
-    built = large.weights * (size / large.stored_bytes)
-    prepared |= {"weights": chosen + built, "cameras": check}
-    smart, series = experiment.smart, experiment.series is not None
-    frames, again = 1 if series else 2, 1 + smart.motion_passes * ITERATION_SHARE
-    steps = {
-        "images": light.frame * frames,
-        "reconstruction": frame * (frames * again),
-        "correlation": vectors.correlate * (1 + smart.motion_passes),
-        "writing": vectors.write,
-    }
-    pair = sum(steps.values(), NOTHING)
-    simulated = experiment.bootstrap.count(pairs)
-    again_simulated = pair * (simulated + 1 if simulated else 0)
-    total = sum(prepared.values(), NOTHING) + full("once") + pair * math.ceil(pairs / workers) + again_simulated
-    step(1.0)
+    if not first.recorded:
+        assumptions.append("particle images are read as fast as the white images: there are none yet")
+    if run.guard is None or not calibrated:
+        prepared["images"] = first.images
+    prepared |= {"weights": first.weights, "cameras": first.cameras}
+    need = memory_of(run, first.weights_bytes + maps, workers)
     disk = Disk(
-        pair=vectors.size,
-        results=vectors.size * pairs,
+        pair=first.file_bytes,
+        results=first.file_bytes * pairs,
         volumes=2 * memory.BYTES_PER_VALUE * experiment.grid.size,
-        weights=size + _maps(calibration) if workers > 1 else 0,
+        weights=first.weights_bytes + _maps(calibration) if workers > 1 else 0,
         free=shutil.disk_usage(_nearest(run.folder.path if stored else Path.cwd())).free,
     )
+    step(1.0)
     return Plan(
         name=experiment.name,
         file=experiment.path,
@@ -174,21 +148,25 @@ def _plan(run: Run, experiment: Experiment, pairs: int, workers: int, scratch: P
         device=run.device,
         shape=experiment.grid.shape,
         voxel_mm=experiment.grid.voxel_mm,
-        reconstructed=whole.finest.grid.shape,
-        reconstructed_mm=whole.finest.grid.voxel_mm,
+        reconstructed=finest.grid.shape,
+        reconstructed_mm=finest.grid.voxel_mm,
         vectors=vector_grid.planned(experiment.correlation, experiment.grid.shape).count,
-        time=Time(
-            preparation=prepared,
-            first=full("once"),
-            pair=pair,
-            steps=steps,
-            simulated=again_simulated,
-            total_s=total.wall_s,
-        ),
-        memory=needed,
+        time=_scaled(experiment, first, prepared, pairs, workers),
+        memory=need,
         disk=disk,
-        limits=tuple(limits_of(whole.finest, needed, disk, steps, workers)),
+        limits=tuple(limits_of(finest, need, disk, first.steps, workers)),
         assumptions=tuple(assumptions),
+    )
+
+
+def _scaled(experiment: Experiment, first: FirstPair, prepared: Mapping[str, Cost], pairs: int, workers: int) -> Time:
+    """Return the time of the campaign."""
+    pair = sum(first.steps.values(), NOTHING)
+    simulated = experiment.bootstrap.count(pairs)
+    again = pair * (simulated + 1 if simulated else 0)
+    total = sum(prepared.values(), NOTHING) + first.once + pair * math.ceil(pairs / workers) + again
+    return Time(
+        preparation=prepared, first=first.once, pair=pair, steps=first.steps, simulated=again, total_s=total.wall_s
     )
 
 
@@ -212,87 +190,40 @@ def _calibration(run: Run, stored: bool, assumptions: list[str]) -> tuple[Calibr
     return thin_lens(run.experiment), False
 
 
-def _volume(run: Run, calibration: Calibration, assumptions: list[str]) -> Volume:
-    """Return the volume as it is reconstructed, as far as that is known before the images are."""
-    experiment, found, factor = run.experiment, run.refinement, run.refinement_factor
-    if experiment.smart.refinement == "auto" and found is None:
-        factor = LARGEST
+def _with_voxels(run: Run, assumptions: list[str]) -> Run:
+    """Return the run with the voxels that it reconstructs, as far as that is known before the images are."""
+    experiment = run.experiment
+    if experiment.smart.refinement == "auto" and run.refinement is None:
+        run = replace(run, refinement=Refinement(pairs=(), size_voxel=None, factor=LARGEST, demanded=LARGEST))
         assumptions.append(f'particles are points: voxels are refined by {LARGEST:g}, the most that "auto" chooses')
     if experiment.guard_mm == "auto" and run.guard is None:
         assumptions.append("no light lies beyond the volume: one guard layer on each side")
-    if experiment.mask is not None:
-        assumptions.append("the whole volume holds fluid: the mask saves some time")
     if experiment.tracking is not None:
         assumptions.append("the time of [tracking] is not in the plan")
     if experiment.in_sequence:
         assumptions.append("each instant is reconstructed by itself: the time of smart.predict differs")
     if experiment.self_calibration.pairs:
         assumptions.append("the time of the self-calibration is not in the plan")
-    size = 0.0 if found is None or found.size_voxel is None else found.size_voxel * factor
-    return Volume(
-        experiment=experiment,
-        guard=run.guard_layers,
-        refinement=factor,
-        calibration=calibration,
-        particle_voxel=max(size, LEAST_POINT),
-    )
+    return run
 
 
-def _parts(whole: Volume, forms: Mapping[str, Form], step: StepProgress) -> tuple[Measured, Measured]:
-    """Measure two parts, after a third one that loads the kernels."""
-    counting, dense = whole.experiment.compute.weights == "count", whole.per_voxel()
-    large = COUNTED_VOXELS if counting else LARGE_VOXELS
-    rests = (
-        all(form.distance is None and not form.separable for form in forms.values())
-        and whole.finest.grid.size >= FEWEST_VOXELS
-    )
-    if rests and not counting:  # dark voxels rest in such volumes, so they do in both parts
-        sizes = [int(1.1 * FEWEST_VOXELS), 2 * FEWEST_VOXELS]
-    else:
-        sizes = [SMALL_VOXELS * large // LARGE_VOXELS, large]
-    parts = [whole.cube, *map(whole.part, sizes)]
-    found = []
-    for number, one in enumerate(parts):
-        found.append(measure(one, forms, dense, check_cameras=number != 1))
-        step(0.2 + 0.5 * (number + 1) / len(parts))
-    return found[1], found[2]
-
-
-def _prepared(
-    run: Run, whole: Volume, calibrated: bool, frame: Cost, large: Measured, assumptions: list[str]
-) -> dict[str, Cost]:
-    """Return the costs of the steps before the weights."""
-    found = {}
-    if not calibrated:
-        dots = preparation.measure_dots(run.experiment, whole.calibration)
-        if dots is None:
-            assumptions.append("the time of the calibration is not in the plan: two planes of the board do not show it")
-        else:
-            found["calibration"] = dots
-    if run.guard is None or run.refinement is None:
-        looked = preparation.look_at_images(run.experiment, whole.calibration, large.images, frame)
-        _, estimated = timed(lambda: memory.weights_bytes(whole.finest, whole.particle_voxel))
-        found["images"] = looked + 2 * estimated  # by the sizes of particles and volume, and once they are known
-    return found
-
-
-def memory_of(whole: Volume, forms: Mapping[str, Form], workers: int, device: Device) -> Memory:
-    """Estimate the memory; refuse a volume that cannot fit into that of the GPU."""
-    finest = whole.finest
-    weights = sum(form.stored_bytes for form in forms.values()) + sum(map(rays_bytes, whole.cameras.values()))
-    gpus = len(worker_plan.visible_gpus()) if device.kind == "cuda" else 1
-    sharing = -(-workers // max(gpus, 1))
-    sizes = tuple(form.device_bytes for form in forms.values())
-    need = DeviceNeed(sizes, beside_bytes(whole.cameras.values(), finest.grid))
-    streamed = device_memory.require(finest, need, device, sharing=sharing)
+def memory_of(run: Run, weights: int, workers: int) -> Memory:
+    """Estimate the memory for weights of a size [byte]; refuse a volume that cannot fit into that of the GPU."""
+    finest = run.reconstructed_experiment
     free = runtime.free_bytes()
+    streamed, whole, least = 0, None, None
+    if free is not None:
+        need = device_memory.estimate_need(finest)
+        sharing = -(-workers // max(len(worker_plan.visible_gpus()), 1))
+        streamed = device_memory.require(finest, need, run.device, sharing=sharing)
+        whole, least = sharing * need.whole, sharing * (need.whole if sharing > 1 else need.least)
     return Memory(
         needed=memory.run_bytes(finest, weights + workers * streamed, workers),
         weights=weights,
         worker=memory.worker_bytes(finest),
         allowed=memory.allowed_bytes(finest),
-        device_needed=None if free is None else sharing * need.whole,
-        device_least=None if free is None else sharing * (need.whole if sharing > 1 else need.least),
+        device_needed=whole,
+        device_least=least,
         device_streamed=streamed,
         device_free=free,
     )

@@ -1,4 +1,4 @@
-"""Time of a piece of work, and how it grows with the size of the work."""
+"""Time of a piece of work."""
 
 from __future__ import annotations
 
@@ -29,8 +29,6 @@ class Cost:
     def __mul__(self, factor: float) -> Cost:
         return Cost(self.wall_s * factor, self.cpu_s * factor)
 
-    __rmul__ = __mul__
-
 
 NOTHING = Cost()
 
@@ -40,32 +38,3 @@ def timed(work: Callable[[], Result]) -> tuple[Result, Cost]:
     wall, cpu = time.perf_counter(), time.process_time()
     result = work()
     return result, Cost(time.perf_counter() - wall, time.process_time() - cpu)
-
-
-def grown(small: tuple[float, Cost], large: tuple[float, Cost], size: float) -> Cost:
-    """Extrapolate a cost that is an affine function of the size of the work.
-
-    Parameters
-    ----------
-    small, large : (float, Cost)
-        Two sizes and their costs.
-    size : float
-        Size to extrapolate to, no less than the larger one.
-
-    Returns
-    -------
-    Cost
-        On the line through both costs; the larger one where the costs do not grow.
-
-    Examples
-    --------
-    >>> grown((1.0, Cost(3.0, 2.0)), (2.0, Cost(5.0, 3.0)), 10.0)
-    Cost(wall_s=21.0, cpu_s=11.0)
-    """
-    (near, one), (far, other) = small, large
-
-    def line(a: float, b: float) -> float:
-        slope = (b - a) / (far - near) if far > near else 0.0
-        return b + slope * (size - far) if slope > 0 else max(a, b)
-
-    return Cost(line(one.wall_s, other.wall_s), line(one.cpu_s, other.cpu_s))
