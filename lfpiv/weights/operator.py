@@ -19,6 +19,7 @@ from lfpiv.calibration.coverage import SEEN_SHARE, warn_seen_by_one
 from lfpiv.files import size_text
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import in_order
+from lfpiv.lightfield.microimage_layout import microimages_of
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.prompt import Card, Shown
 from lfpiv.settings.processing import Compute
@@ -379,6 +380,9 @@ def build_weights(
     if form not in FORMS:
         raise ValueError(f"form: expected one of {', '.join(FORMS)}, got {form!r}.")
     cameras = calibration.cameras
+    for camera in cameras.values():
+        if not hasattr(camera, "microimages"):  # a model of a user's own
+            camera.microimages = microimages_of(camera.optics, camera.lattice)
     hexagonal = [name for name, camera in cameras.items() if camera.lattice.layout != "square"]
     if form == "profiles" and hexagonal:
         raise ValueError(f"form: 'profiles' need square microlenses, those of camera {hexagonal[0]!r} are hexagonal.")

@@ -1,0 +1,141 @@
+"""One small experiment, made, run and killed and resumed by the command line, and what other processes compute."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from contract import scene
+from contract.stored import Stored
+
+BITS = Path(__file__).with_name("bits.py")
+WAIT_S = 600.0
+"""Longest time that a process may take [s]."""
+SOLID = '[[volume.solid]]\nkind = "half_space"\npoint_mm = [0.0, -0.1, 0.0]\nnormal = [0.0, 1.0, 0.0]\n\n'
+"""The wall of `scene.INSTANTS` as an experiment states it."""
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--write-hashes", action="store_true", help="store the contract's hashes of this machine and its loops anew"
+    )
+
+
+def start(*command, loops=None, **options):
+    """Start a Python process with loops of the CPU or of a GPU; default: those of this process."""
+    environment = os.environ | {"COLUMNS": "200"}
+    if loops is not None:
+        environment.pop("LFPIV_EMULATE_GPU", None)
+        environment |= {"LFPIV_EMULATE_GPU": "1"} if loops == "gpu" else {}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *map(str, command)], env=environment, **pipes, **options)
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a finished process left."""
+
+    status: int
+    output: str
+    errors: str
+
+
+def edit(file, old, new):
+    """Replace a text in a file."""
+    text = file.read_text("utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new, 1), "utf-8")
+
+
+def finish(process):
+    output, errors = process.communicate(timeout=WAIT_S)
+    return Done(process.returncode, output, errors)
+
+
+def lfpiv(*arguments):
+    """Run the command line."""
+    return finish(start("-m", "lfpiv", *arguments))
+
+
+def done(*arguments):
+    """Run the command line, which must succeed."""
+    found = lfpiv(*arguments)
+    assert found.status == 0, found.errors
+    return found
+
+
+@dataclass(frozen=True)
+class Run:
+    """An experiment and its results. Tests work on copies."""
+
+    experiment: Path
+    out: Path
+    killed: int = 0
+    """Exit status of an earlier invocation, which a signal ended."""
+    early: bytes = b""
+    """Vectors of the first pair as the killed invocation left them."""
+
+
+@pytest.fixture(scope="session")
+def loops():
+    """Loops of the kernels in this process."""
+    return "gpu" if "LFPIV_EMULATE_GPU" in os.environ else "cpu"
+
+
+@pytest.fixture(scope="session")
+def stored(request):
+    return Stored(request.config.getoption("--write-hashes", default=False))
+
+
+@pytest.fixture(scope="session")
+def computed(tmp_path_factory):
+    """Arrays of all cases of `bits.py` by one and by two threads, and by loops for a GPU."""
+    folder = tmp_path_factory.mktemp("bits")
+    ways = {"one thread": (1, "cpu"), "two threads": (2, "cpu"), "loops for a GPU": (1, "gpu")}
+    started = {name: start(BITS, folder / f"{name}.npz", cores, loops=own) for name, (cores, own) in ways.items()}
+    found = {}
+    for name, process in started.items():
+        finished = finish(process)
+        assert finished.status == 0, finished.errors
+        with np.load(folder / f"{name}.npz") as arrays:
+            found[name] = {}
+            for key, values in arrays.items():
+                case, array = key.split("/")
+                found[name].setdefault(case, {})[array] = values
+    return found
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """Run on image pairs with tracked particles. An invocation before is killed after its first pair."""
+    folder = tmp_path_factory.mktemp("pairs")
+    experiment = scene.simulate(done, folder, scene.PAIRS)
+    out, first = folder / "out", folder / "out" / "vectors" / "pair_0000.nc"
+    killed = start("-m", "lfpiv", "run", experiment, "--out", out, "--keep-volumes", start_new_session=True)
+    deadline = time.monotonic() + WAIT_S
+    while not first.exists() and killed.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(killed.pid, signal.SIGKILL)
+    status, early = finish(killed).status, first.read_bytes()
+    done("run", experiment, "--out", out, "--keep-volumes")
+    return Run(experiment, out, status, early)
+
+
+@pytest.fixture(scope="session")
+def series(tmp_path_factory, run):
+    """Run on a time series beside a wall, with tracks, calibrated as `run`."""
+    folder = tmp_path_factory.mktemp("series")
+    experiment = scene.simulate(done, folder, scene.INSTANTS)
+    edit(experiment, "[smart]", SOLID + "[smart]\nrefinement = 1.0")
+    for part in ("white", "board"):  # the same pixels, and the times of the files that were calibrated
+        shutil.copytree(run.experiment.parent / part, experiment.parent / part, dirs_exist_ok=True)
+    (folder / "out").mkdir()
+    shutil.copy2(run.out / "calibration.h5", folder / "out")
+    done("run", experiment, "--out", folder / "out")
+    return Run(experiment, folder / "out")
