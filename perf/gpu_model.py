@@ -114,7 +114,7 @@ class Passes:
             if sieve_voxel > 0:
                 step, momentum = SharpenedStep(light, sieve), Momentum(light)
             exponent = equations.back_project(light)
-            proposal = next(State(light, momentum, (step,)).proposals(exponent, None))
+            proposal = next(State(light, momentum, (step,)).proposals(exponent))
             equations.compare(sieve(proposal.coefficients))
 
         return trace(run, self._tracer)
