@@ -33,6 +33,8 @@ LEAST_FOR_NOTHING = 2
 """Least number of pairs without common particles that a refusal of them needs."""
 NEIGHBOURS = (1, -1, 2, -2)
 """Pairs, or instants, by which a camera may be late."""
+FARTHEST = 10
+"""Largest such distance that is tried where no pair fits and no other mistake explains it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,8 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     shown = ShownParticles(experiment, weights.cameras, tried)
     judged = _judge(shown if len(tried) > 1 else replace(shown, pairs=()), tried, weights)
     refusals = _refusals(experiment, names, judged)
+    if not refusals and judged and not any(one.fits for one in judged.values()):
+        refusals = _far_delay(experiment, names, shown, weights, list(judged))
     if refusals:
         return _told(
             "; ".join(dict.fromkeys(str(one.figures["found"]) for one in refusals)),
@@ -179,17 +183,45 @@ def _images(experiment: Experiment) -> Sequence[int]:
 def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
     """Return the refusals of pairs by mistakes that were clearly made.
 
-    If the images of no judged pair fit, a mistake on which those agree that show any was made in all pairs of the run.
+    If the images of no judged pair fit, a mistake that explains half of them or more was made in all pairs of the run.
     """
     each = {pair: one.mistakes for pair, one in judged.items() if one.mistakes}
     if judged and not any(one.fits for one in judged.values()):
-        shared = list(each.values()) or [reduce(Judgement.joined, judged.values()).mistakes] * len(judged)
-        made = [one for one in shared[0] if all(one in others for others in shared)]
-        if made and 2 * len(shared) >= len(judged):
+        if made := _shared(list(judged.values())):
             return [_refusal(experiment, names, made)]
         if 2 * len(each) < len(judged):
             return []
     return [_numbered(experiment, _refusal(experiment, names, made), pair) for pair, made in each.items()]
+
+
+def _far_delay(
+    experiment: Experiment, names: Sequence[str], shown: ShownParticles, weights: Weights, pairs: Sequence[int]
+) -> list[Warning]:
+    """Return the refusal of all pairs if a camera is late or early by more pairs than are usually tried."""
+    fit, far = ImageFit(weights), [late for late in range(-FARTHEST, FARTHEST + 1) if abs(late) > max(NEIGHBOURS)]
+    for pair in pairs:
+        others, _ = _shifts(experiment, pair)
+        found = judge(fit, shown, pair, others, [late for late in far if pair + late in experiment.numbers])
+        if found.mistakes and found.mistakes[0].kind is Kind.LATE:
+            return [_refusal(experiment, names, found.mistakes)]
+    return []
+
+
+def _shared(judged: Sequence[Judgement]) -> Sequence[Mistake]:
+    """Return the mistake that was made in all pairs, with others that explain them as well; empty without any.
+
+    Pairs that show mistakes agree on it, or else all pairs together show it in which it can be tried.
+    """
+    each = [one.mistakes for one in judged if one.mistakes]
+    agreed = [one for one in each[0] if all(one in others for others in each)] if each else []
+    if agreed and 2 * len(each) >= len(judged):
+        return agreed
+    for likeliest in dict.fromkeys(one.tried[0] for one in judged if one.tried):
+        having = [one for one in judged if likeliest in one.left]
+        made = reduce(Judgement.joined, having).mistakes
+        if likeliest in made and 2 * len(having) >= len(judged) and all(likeliest in others for others in each):
+            return made
+    return []
 
 
 def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:

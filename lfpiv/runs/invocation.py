@@ -122,6 +122,8 @@ class Invocation:
     """None if no weights were built."""
     workers: Workers | None = None
     """None if no pair was tried."""
+    settled: int | None = None
+    """Pairs that were finished when pairs that stand out were looked for; None if they were not."""
     reused: tuple[str, ...] = ()
     """Results of earlier invocations, named for the summary."""
     warnings: Sequence[Warning] = ()

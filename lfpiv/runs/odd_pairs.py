@@ -15,7 +15,8 @@ import numpy as np
 from lfpiv import warn
 from lfpiv.results import netcdf
 from lfpiv.results.pair_files import PairFiles
-from lfpiv.runs import belonging, pair_figures, pair_vectors
+from lfpiv.results.particles import read_particles
+from lfpiv.runs import belonging, pair_figures, pair_vectors, particles
 from lfpiv.runs.moved_cameras import ShownParticles
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_figures import PairFigures
@@ -83,7 +84,7 @@ def settle(
 
 
 def _refuse(files: PairFiles, warning: Warning) -> None:
-    """Write the vectors of a pair again, none of them valid."""
+    """Write the vectors of a pair, and its linked particles, again, none of them valid."""
     vectors, condensed = netcdf.read_vectors(files.vectors), netcdf.read_reconstruction(files.vectors)
     assert condensed is not None
     found = (*warn.from_text(vectors.attrs["warnings"]), warning)
@@ -91,3 +92,5 @@ def _refuse(files: PairFiles, warning: Warning) -> None:
     vectors.attrs["warnings"] = warn.to_text(found)
     measured = pair_figures.measure(vectors, condensed, found)
     files.write_vectors(vectors, condensed, {"figures": measured.to_json()})
+    if files.particles is not None and files.has_particles():
+        files.write_particles(particles.refused(read_particles(files.particles)))

@@ -32,12 +32,13 @@ from lfpiv.runs import belonging, pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
-from lfpiv.runs.pair_vectors import measure_vectors, without_unmeasured
+from lfpiv.runs.pair_vectors import REFUSED, measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
-from lfpiv.runs.particles import FrameFits, track
+from lfpiv.runs.particles import FrameFits, refused, track
 from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
+from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
@@ -350,6 +351,8 @@ class PairWork:
             vectors.attrs["warnings"] = warn.to_text(found)
         figures = pair_figures.measure(vectors, condensed, found)
         self._log(files.pair, volumes.between)
+        if figures.verdict not in (*REFUSED, Verdict.GOOD.value):
+            self._log(files.pair, [figures.few_valid_warning(files.pair)])
         if figures.lost_unseeded > 0:
             self._log(files.pair, [figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
@@ -372,6 +375,8 @@ class PairWork:
         """Find and link the particles of both frames and write them; return the warnings about them."""
         light = [self.light_again(file.frame) for file in files.frames]
         table, found = track(self.search, self.fits, light, volumes, vectors)
+        if vectors.attrs["verdict"] in REFUSED:
+            table = refused(table)
         self.write(partial(files.write_particles, table))
         name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
         log.info(

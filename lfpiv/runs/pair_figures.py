@@ -109,6 +109,10 @@ class PairFigures:
         shares = {"share": self.unseeded_fraction, "lost": self.lost_unseeded}
         return Warning(code=Code.UNSEEDED, pairs=(pair,), figures=shares)
 
+    def few_valid_warning(self, pair: int) -> Warning:
+        """Return the warning that few vectors are valid."""
+        return Warning(code=Code.FEW_VALID, pairs=(pair,), figures={"share": self.valid_share, "verdict": self.verdict})
+
     def to_json(self) -> dict[str, Any]:
         """Return the form that a file stores; figures that are not known are left out."""
         stored = asdict(self) | {"warnings": [warning.to_json() for warning in self.warnings]}

@@ -14,7 +14,7 @@ from lfpiv.lightfield import image_checks
 from lfpiv.reconstruction.motion import Motion, unshared_quality
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.warn import Code
+from lfpiv.warn import Code, collected
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
 """Verdict on the vectors of a pair if the images of one frame show only noise."""
@@ -23,10 +23,14 @@ MISPLACED = "an image does not belong to its camera's white image: none of the v
 UNLIKE_PARTICLES = "the images of the cameras do not belong together: none of the vectors counts"
 """Verdict on the vectors of a pair whose images of one instant show different particles."""
 
+REFUSED = (NO_PARTICLES, MISPLACED, UNLIKE_PARTICLES)
+"""Verdicts on the vectors of pairs of which none is valid."""
+
 
 def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Experiment) -> xr.Dataset:
-    """Correlate the volumes of two frames."""
-    vectors = correlate(first, second, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
+    """Correlate the volumes of two frames. That few vectors are valid is not logged: the pair may be refused."""
+    with collected(quiet=True):
+        vectors = correlate(first, second, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
     return _with_motion(vectors, (first, second))
 
 

@@ -80,6 +80,11 @@ def track(
     return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
 
 
+def refused(table: xr.Dataset) -> xr.Dataset:
+    """Mark all links of a pair as not valid."""
+    return table.assign(valid=xr.zeros_like(table["valid"])).assign_attrs(valid_links=0)
+
+
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
     """Return a warning if too few cameras see particles alone for particles to be told apart."""
     share, limit = float(np.max(table.attrs["hidden"])), HIDDEN_ONE if cameras == 1 else HIDDEN

@@ -30,6 +30,7 @@ from lfpiv.runs import (
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
+from lfpiv.runs.pair_vectors import REFUSED
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.todo import Todo
@@ -288,8 +289,10 @@ def _known(weights: Weights | None) -> _Weights:
 def _settle(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
     """Refuse pairs whose images do not belong together; return the invocation, and the weights if they were built."""
     lazy = _Lazily(current, prepared, weights)
-    if done.weights is not None:  # otherwise no image was reconstructed
+    count = len(current.finished)
+    if done.weights is not None or count > current.earlier.settled:  # an earlier run may have ended before it settled
         current.settle(lazy.work)
+        done = replace(done, settled=count)
     return lazy.after(done), lazy.weights
 
 
@@ -297,6 +300,7 @@ def _follow(current: Run, prepared: Prepared, done: Invocation, weights: _Weight
     """Make the tracks of a time series; return the invocation, and the weights if they were built for them."""
     lazy = _Lazily(current, prepared, weights)
     pairs = current.pairs_with_particles() if current.experiment.series is not None else []
+    pairs = [pair for pair in pairs if not (figures := current.finished.get(pair)) or figures.verdict not in REFUSED]
     step = current.step(TRACKS)
     tracks.decide(current.experiment, current.folder, current.tracks_stamp, pairs, lazy.work, step)
     return lazy.after(done), lazy.weights

@@ -85,6 +85,8 @@ class EarlierSummary:
     weights_s: float = 0.0
     refusals: tuple[Warning, ...] = ()
     """Why vectors are not valid, see `belonging.check`."""
+    settled: int = 0
+    """Pairs that were finished when pairs that stand out were last looked for; see `odd_pairs.settle`."""
     failed: Mapping[int, str] = field(default_factory=dict)
     """Pair -> why it failed."""
     peak_memory_mib: float | None = None
@@ -121,6 +123,7 @@ class _Stored:
     timings_s: dict[str, float | None] = field(default_factory=dict)
     failed: list[_Failure] = field(default_factory=list)
     peak_memory_mib: float | None = None
+    pairs_settled: int = 0
 
 
 def read(path: Path) -> EarlierSummary:
@@ -146,6 +149,7 @@ def read(path: Path) -> EarlierSummary:
         weights=known.weights,
         weights_s=known.timings_s.get("weights") or 0.0,
         refusals=refusals,
+        settled=known.pairs_settled,
         failed={failure.pair: failure.reason for failure in known.failed},
         peak_memory_mib=known.peak_memory_mib,
     )
@@ -194,6 +198,7 @@ def build(
         "damping": None if contents.damping is None else contents.damping.to_json(),
         "refinement": _refinement(experiment, contents.refinement),
         "pairs_finished": pairs.count,
+        "pairs_settled": earlier.settled if done.settled is None else done.settled,
         "pairs_file": folder.pairs.name if pairs.count > MOST_LISTED else None,
         "pairs": pairs.listed,
         "pairs_failed": len(failed) + max(done.tried.failures - len(done.tried.failed), 0),
@@ -381,8 +386,7 @@ def _of_pair(pair: int, figures: PairFigures) -> Iterator[Warning]:
         words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
         yield Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words)
     if figures.verdict != Verdict.GOOD.value:
-        few = {"share": figures.valid_share, "verdict": figures.verdict}
-        yield Warning(code=Code.FEW_VALID, pairs=(pair,), figures=few)
+        yield figures.few_valid_warning(pair)
     if figures.lost_unseeded > 0:
         yield figures.unseeded_warning(pair)
 

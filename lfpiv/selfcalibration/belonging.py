@@ -211,11 +211,9 @@ class Judgement:
     def mistakes(self) -> tuple[Mistake, ...]:
         """The mistake that was clearly made, with others that explain the images as well; empty for none."""
         clear = [one for one in self.tried if self.margin(one) < -CLEAR]
-        if not clear or clear[0] not in self.turned:
+        if not clear or not self._beats_chance(clear[0]):
             return ()
         best = self.left[clear[0]]
-        if not self._beats_chance(clear[0]):
-            return ()
         return tuple(one for one in clear if advantage(best, self.left[one]) < SURE)
 
     def _beats_chance(self, best: Mistake) -> bool:
@@ -227,7 +225,9 @@ class Judgement:
         """
         others = [self.left[one] for one in self.chance if one != best and one in self.left]
         others += [self.left[RIGHT]] if best.kind in (Kind.LATE, Kind.SHIFTED) else []
-        others = others or [self.turned[best]]
+        others = others or ([self.turned[best]] if best in self.turned else [])
+        if not others:
+            return False
         count = min(len(frames) for frames in (*others, self.left[best]))
         level, *chance = (sum(float(one.sum()) for one in frames[:count]) for frames in (self.left[best], *others))
         clear = all(advantage(self.left[best], frames) > CLEAR for frames in others)
@@ -250,7 +250,7 @@ class Judgement:
     @property
     def over_chance(self) -> float:
         """Return the least advantage of the images as they are over those of other particles [standard errors]."""
-        return min(self.margin(one) for one in self.chance if one in self.left)
+        return min((self.margin(one) for one in self.chance if one in self.left), default=0.0)
 
     def joined(self, other: Judgement) -> Judgement:
         """Return the judgement by the frames of both, about the mistakes that were tried in both."""

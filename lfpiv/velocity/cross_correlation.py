@@ -22,6 +22,7 @@ from lfpiv.velocity.prepared_pair import CheckedPair
 from lfpiv.velocity.settings import DEFAULTS, CorrelationSettings, triple, windows_of
 from lfpiv.velocity.systematic import unexplained, with_systematic
 from lfpiv.velocity.volume_pair import VoxelAxes, moves_beyond
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -183,7 +184,7 @@ def correlate(
     if verdict is not Verdict.GOOD:
         if moves_beyond(pair.first, pair.second, first_search):
             verdict = Verdict.TOO_FAR
-        log.warning("correlation: %.0f %% of the vectors are valid; %s", 100 * share, verdict.value)
+        warn(log, Warning(code=Code.FEW_VALID, figures={"share": share, "verdict": verdict.value}))
     if voxels.unseeded is not None and voxels.unseeded_fraction >= LEAST_TOLD:
         log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)
     attributes = {
