@@ -1,6 +1,6 @@
 """Rules of the house that a machine can check, as a script: ``python tests/style.py`` names what breaks them.
 
-Rules for the packages: who imports whom, who starts devices, and kernels that say what they write. The house is shown
+Rules for the packages: who imports whom, and kernels that say what they write. The house is shown
 in `docs/contribute.md`; `MAY_IMPORT` is its table of arrows. Rules for the tests: they use public names, and each of
 them checks something. ``ruff`` has the other rules of style.
 """
@@ -260,17 +260,12 @@ def circles():
             yield ROOT, f"a circle among {', '.join(sorted(left))}"
 
 
-def devices():
-    """Files of Taichi kernels have no postponed annotations, and only the runtime starts devices."""
+def taichi():
+    """Files of Taichi kernels have no postponed annotations."""
     for path in KERNEL_FILES + PACKAGE_FILES:
-        tree, names = tree_of(path), set(imported(tree_of(path)))
-        if "taichi" in names and any(kernels(tree)) and "__future__.annotations" in names:
+        names = set(imported(tree_of(path)))
+        if "taichi" in names and any(kernels(tree_of(path))) and "__future__.annotations" in names:
             yield path, "Taichi rejects postponed annotations"
-        calls = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call))
-        called = {ast.unparse(one) for one in calls if last_name(one) in ("init", "reset")}
-        started = called & {"ti.init", "wp.init", "taichi.init", "warp.init", "ti.reset"}
-        if started and path.name != "runtime.py":
-            yield path, f"only the runtime starts devices: {', '.join(started)}"
 
 
 def kernel_arguments():
@@ -302,7 +297,7 @@ def tests():
                 yield path, f"{function.name} checks nothing"
 
 
-RULES = (imports, circles, devices, kernel_arguments, tests)
+RULES = (imports, circles, taichi, kernel_arguments, tests)
 
 
 def broken():
