@@ -4,6 +4,7 @@ import importlib.util
 import os
 import pickle
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,12 @@ def made_once(tmp_path_factory, name, make):
             folder.mkdir()
             stored.write_bytes(pickle.dumps(make(folder)))
         return pickle.loads(stored.read_bytes())
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory):
+    """Return `made_once` in the folders of these tests."""
+    return partial(made_once, tmp_path_factory)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,22 +1,18 @@
-"""One small experiment, made, run and killed and resumed by the command line, and what other processes compute."""
+"""One small experiment, made, run, killed and resumed by the command line, and what other processes compute."""
 
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from contract import scene
+from contract.command import WAIT_S, Run, done, edit, finish, start
 from contract.stored import Stored
 
 BITS = Path(__file__).with_name("bits.py")
-WAIT_S = 600.0
-"""Longest time that a process may take [s]."""
 SOLID = '[[volume.solid]]\nkind = "half_space"\npoint_mm = [0.0, -0.1, 0.0]\nnormal = [0.0, 1.0, 0.0]\n\n'
 """The wall of `scene.INSTANTS` as an experiment states it."""
 
@@ -25,61 +21,6 @@ def pytest_addoption(parser):
     parser.addoption(
         "--write-hashes", action="store_true", help="store the contract's hashes of this machine and its loops anew"
     )
-
-
-def start(*command, loops=None, **options):
-    """Start a Python process with loops of the CPU or of a GPU; default: those of this process."""
-    environment = os.environ | {"COLUMNS": "200"}
-    if loops is not None:
-        environment.pop("LFPIV_EMULATE_GPU", None)
-        environment |= {"LFPIV_EMULATE_GPU": "1"} if loops == "gpu" else {}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, *map(str, command)], env=environment, **pipes, **options)
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a finished process left."""
-
-    status: int
-    output: str
-    errors: str
-
-
-def edit(file, old, new):
-    """Replace a text in a file."""
-    text = file.read_text("utf-8")
-    assert old in text
-    file.write_text(text.replace(old, new, 1), "utf-8")
-
-
-def finish(process):
-    output, errors = process.communicate(timeout=WAIT_S)
-    return Done(process.returncode, output, errors)
-
-
-def lfpiv(*arguments):
-    """Run the command line."""
-    return finish(start("-m", "lfpiv", *arguments))
-
-
-def done(*arguments):
-    """Run the command line, which must succeed."""
-    found = lfpiv(*arguments)
-    assert found.status == 0, found.errors
-    return found
-
-
-@dataclass(frozen=True)
-class Run:
-    """An experiment and its results. Tests work on copies."""
-
-    experiment: Path
-    out: Path
-    killed: int = 0
-    """Exit status of an earlier invocation, which a signal ended."""
-    early: bytes = b""
-    """Vectors of the first pair as the killed invocation left them."""
 
 
 @pytest.fixture(scope="session")
@@ -112,9 +53,12 @@ def computed(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory):
+def run(once):
     """Run on image pairs with tracked particles. An invocation before is killed after its first pair."""
-    folder = tmp_path_factory.mktemp("pairs")
+    return once("contract-pairs", killed_and_resumed)
+
+
+def killed_and_resumed(folder):
     experiment = scene.simulate(done, folder, scene.PAIRS)
     out, first = folder / "out", folder / "out" / "vectors" / "pair_0000.nc"
     killed = start("-m", "lfpiv", "run", experiment, "--out", out, "--keep-volumes", start_new_session=True)

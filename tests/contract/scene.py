@@ -36,7 +36,6 @@ size_mm = [1.8, 1.8, 1.2]
 voxel_mm = 0.1
 
 [particles]
-count = 60
 sigma_mm = 0.06
 {particles}
 
@@ -55,8 +54,10 @@ hidden = [12]
 epochs = 60
 """
 
-PAIRS = "pairs = 2"
-INSTANTS = 'instants = 4\n\n[[wall]]\nkind = "half_space"\npoint_mm = [0.0, -0.1, 0.0]\nnormal = [0.0, 1.0, 0.0]'
+PAIRS = "count = 60\npairs = 2"
+INSTANTS = (
+    'count = 36\ninstants = 4\n\n[[wall]]\nkind = "half_space"\npoint_mm = [0.0, -0.1, 0.0]\nnormal = [0.0, 1.0, 0.0]'
+)
 
 
 def simulate(command, folder, particles):

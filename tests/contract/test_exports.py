@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
-from contract.conftest import done
+from contract.command import done
 
 import lfpiv
 

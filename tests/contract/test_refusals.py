@@ -7,7 +7,7 @@ import signal
 import numpy as np
 import pytest
 import tifffile
-from contract.conftest import edit, finish, start
+from contract.command import edit, finish, start
 
 import lfpiv
 

@@ -6,7 +6,7 @@ import signal
 
 import numpy as np
 import xarray as xr
-from contract.conftest import done
+from contract.command import done
 from contract.scene import DISPLACEMENT_VOXEL, DT_S, VOXEL_MM
 
 import lfpiv as library
