@@ -18,12 +18,12 @@ from lfpiv.selfcalibration.belonging import ITERATIONS, PART_LENSES, Images
 from lfpiv.weights.operator import Weights
 
 CLEAR = 6.0
-"""Least lack of light of a dark part [standard errors]. The darkest of all rectangles of a sound sensor lacks 5.4."""
+"""Least lack of light of a dark part [standard errors]. The darkest rectangle of a sound sensor lacks up to 5."""
 STANDS_OUT = 2.0
 """Least lack of light of a dark part, over the lack in any other camera: where particles are few, all lack some."""
 CELLS = 12
 """Largest number of cells along each edge of the region of a sensor that sees the volume."""
-DARK = 0.5
+DARK = 0.25
 """Largest root of a dark region's light, over that of the light expected there."""
 LEAST_SHARE = 0.1
 """Least share of a sensor's expected light in a dark region, both as roots."""
