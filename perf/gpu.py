@@ -45,7 +45,7 @@ def run_stage(name: str, given: argparse.Namespace) -> dict[str, Any]:
         name,
         str(given.out),
         "--scale",
-        "small" if given.emulate else "paper",
+        "tiny" if given.emulate else "paper",
         "--minutes",
         str(given.minutes),
     ]

@@ -1,8 +1,8 @@
 """The stages of `gpu`: each runs in a process of its own and writes what it finds, as it finds it, to a JSON file.
 
-    python perf/gpu_stages.py STAGE FOLDER [--scale small|paper] [--minutes M] [--sample FOLDER]
+    python perf/gpu_stages.py STAGE FOLDER [--scale tiny|medium|paper] [--minutes M] [--sample FOLDER]
 
-Without a GPU the stages run on the CPU: with ``LFPIV_EMULATE_GPU=1`` by the loops for a GPU, at scale "small". So their
+Without a GPU the stages run on the CPU: with ``LFPIV_EMULATE_GPU=1`` by the loops for a GPU, at scale "tiny". So their
 own code is tested. Times then mean nothing.
 """
 
@@ -40,7 +40,7 @@ PAIRS = 20
 VECTORS_VOXEL = 0.02
 """Largest rms difference of the vectors of two devices [voxel]: sums in another order move a fit of SMART by a tenth of
 its error, which is 0.1 to 0.2 voxel."""
-COPIED = {"small": 1 << 20, "paper": 1 << 28}
+COPIED = {"tiny": 1 << 20, "paper": 1 << 28}
 """Floats that a copy reads and writes to measure the bandwidth of the memory."""
 TINY: dict[str, Any] = {"voxels": 16, "sensor": (400, 560)}
 """Volume and sensor that compute-sanitizer, which takes a hundred times as long, can look at."""
@@ -189,7 +189,7 @@ def taichi(job: Job) -> None:
     """Run Taichi's kernels: the mapping's tests, and its cases and counts of rays with their times."""
     small = ("tests/calibration/test_network.py",)
     run_tests(job, "tests", *(TAICHI_TESTS if job.scale == "paper" else small), "-k", "not weights or count_kernel")
-    names = ("mapping", "count") if job.scale == "small" else ("mapping", "count", "train")
+    names = ("mapping", "count") if job.scale != "paper" else ("mapping", "count", "train")
     cases(job, *(f"{name}_small" for name in names))
     if job.scale == "paper":
         cases(job, "mapping_paper", "count_paper")
@@ -373,6 +373,13 @@ class Pair:
         return lfpiv.correlate(*volumes, dt_s=1.0)
 
 
+def size_of(scale: str) -> dict[str, Any]:
+    """Return the voxels along an edge and the sensor of a scale."""
+    import cases as benchmark
+
+    return TINY if scale == "tiny" else benchmark.SCALES[scale]
+
+
 def make_pair(edge: int, sensor: tuple[int, int], found: Findings) -> Pair:
     """Build the weights of a cube of voxels and project two volumes of particles."""
     import inputs
@@ -445,12 +452,10 @@ def measure_pair(job: Job, pair: Pair, pairs: int) -> Any:
 
 def paper(job: Job) -> None:
     """Measure a pair of the published size, 20 pairs in a row, and the count of its rays."""
-    import cases as benchmark
-
     from lfpiv_kernels import runtime
 
     runtime.start(device())
-    of = benchmark.SCALES[job.scale]
+    of = size_of(job.scale)
     pair = make_pair(of["voxels"], of["sensor"], job.found)
     measure_pair(job, pair, PAIRS if job.scale == "paper" else 1)
 
@@ -502,7 +507,7 @@ def limits(job: Job) -> None:
     names = ["project", "back_project", "smart", "correlate_8", "deform", "vectors", "footprint", "smart_subsets"]
     import cases as benchmark
 
-    scale = "small" if job.scale == "small" else "medium"
+    scale = "small" if job.scale != "paper" else "medium"
     known = [f"{name}_{scale}" for name in names if f"{name}_{scale}" in benchmark.CASES]
     cases(job, *(known if job.scale == "paper" else known[:1]))
 
@@ -528,9 +533,8 @@ def profile(job: Job) -> None:
         if not sanitizer:
             job.found.add("compute-sanitizer", "not installed")
             break
-        status, seconds, said = command(
-            job, tool, sanitizer, "--tool", tool, "--error-exitcode", "9", "--print-limit", "20", *script, "small"
-        )
+        options = ("--report-api-errors", "no", "--error-exitcode", "9", "--print-limit", "20")
+        status, seconds, said = command(job, tool, sanitizer, "--tool", tool, *options, *script, "tiny")
         job.found.add(tool, {"status": status, "seconds": seconds, "said": said[-1500:]})
         job.found.require(status == 0, f"{tool}: {said[-600:]}")
 
@@ -561,12 +565,10 @@ def counters(said: str) -> dict[str, Any]:
 
 def launch(job: Job) -> None:
     """Reconstruct and correlate a pair once, for the profiler."""
-    import cases as benchmark
-
     from lfpiv_kernels import runtime
 
     runtime.start(device())
-    of = TINY if job.scale == "tiny" else benchmark.SCALES[job.scale]
+    of = size_of(job.scale)
     pair = make_pair(of["voxels"], of["sensor"], job.found)
     pair.vectors(pair.volumes())
 
@@ -576,7 +578,7 @@ def threads(job: Job) -> None:
     for count in (1, 2, 4, 8, os.cpu_count() or 1) if job.scale == "paper" else (1, 2):
         done, seconds, said = command(
             job, str(count), sys.executable, __file__, "frame", str(job.folder), "--edge", str(count), "--scale",
-            "medium" if job.scale == "paper" else "small", LFPIV_EMULATE_GPU="",
+            "medium" if job.scale == "paper" else "tiny", LFPIV_EMULATE_GPU="",
         )  # fmt: skip
         if (path := job.folder / "frame.json").exists():
             job.found.add(f"{count} threads", json.loads(path.read_text())["figures"])
@@ -586,12 +588,10 @@ def threads(job: Job) -> None:
 
 def frame(job: Job, count: int) -> None:
     """Reconstruct a frame on some threads of the CPU."""
-    import cases as benchmark
-
     from lfpiv_kernels import runtime
 
     runtime.start("cpu", threads=count)
-    of = benchmark.SCALES[job.scale]
+    of = size_of(job.scale)
     pair = make_pair(of["voxels"], of["sensor"], job.found)
     pair.solver.solve(pair.images[0])
     job.found.add("a frame [s]", min(timed(lambda: pair.solver.solve(pair.images[1]))[1] for _ in range(2)))
@@ -607,7 +607,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("stage", choices=[*STAGES, "cube", "frame", "launch"])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--scale", choices=("tiny", "small", "medium", "paper"), default="paper")
+    parser.add_argument("--scale", choices=("tiny", "medium", "paper"), default="paper")
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--sample", type=Path, help="folder with the sample experiment")
     parser.add_argument("--edge", type=int, default=32, help="voxels of the edge of `cube`")

@@ -1,53 +1,78 @@
-"""The script for a machine with a GPU, as far as it goes without one."""
+"""The stages for a machine with a GPU, as far as they go without one."""
 
+import argparse
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import gpu
+import gpu_stages
 import pytest
-from gpu import table
 
 SCRIPT = Path(gpu.__file__)
-MOST_SECONDS = 0.1
-"""Of a small case: a processor takes as long."""
-LINES = [
-    {"case": "machine", "cores": 2},
-    {"case": "smart_small", "metric": "wall", "value": 0.5},
-    {"case": "smart_small", "metric": "stored_bytes", "value": 1e9},
-    {"case": "deform_small", "metric": "wall", "value": 0.25},
-    {"case": "train_small", "metric": "wrong", "value": "it does not converge"},
-]
 
 
-def test_table_has_measured_and_predicted_times_and_no_time_of_a_wrong_result():
-    rows = table(LINES, 4e9, {"smart_small": 0.125}.get)
-    assert [row.split() for row in rows[1:]] == [
-        ["smart_small", "0.5000", "s", "0.1250", "s", "0.50"],
-        ["deform_small", "0.2500", "s"],
-        ["train_small", "wrong:", "it", "does", "not", "converge"],
-    ]
-
-
-@pytest.mark.slow
-def test_the_model_predicts_the_cases_that_it_knows():
-    times = gpu.predicted_times(["project_small", "deform_small", "footprint_small"])
-    assert 0 < times["project_small"] < MOST_SECONDS
-    assert 0 < times["deform_small"] < MOST_SECONDS
-    assert times["footprint_small"] is None
-
-
-def test_a_prediction_that_fails_is_none_and_the_others_stay(monkeypatch, tmp_path):
-    script = tmp_path / "perf" / "gpu_model.py"
-    script.parent.mkdir()
-    script.write_text("""print('{"smart_small": 0.125}', flush=True); raise MemoryError""")
-    monkeypatch.setattr(gpu, "ROOT", tmp_path)
-    assert gpu.predicted_times(["smart_small", "deform_small"]) == {"smart_small": 0.125, "deform_small": None}
+def run(out, *arguments, **environment):
+    command = [sys.executable, str(SCRIPT), "--out", str(out), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
 
 
 def test_without_a_gpu_the_script_says_so_and_writes_nothing(device, tmp_path):
     if device.kind == "cuda":
         pytest.skip("there is a GPU")
-    done = subprocess.run([sys.executable, SCRIPT, "--out", tmp_path / "gpu"], capture_output=True, text=True)
-    assert done.returncode == 2 and "none is visible" in done.stderr
+    done = run(tmp_path / "gpu")
+    assert done.returncode == 2 and "no GPU is visible" in done.stderr
     assert not (tmp_path / "gpu").exists()
+
+
+def test_a_stage_that_passed_is_not_repeated_and_a_failure_is_told(tmp_path, monkeypatch):
+    script = tmp_path / "perf" / "gpu_stages.py"
+    script.parent.mkdir()
+    script.write_text("""
+import json, pathlib, sys
+stage, folder = sys.argv[1], pathlib.Path(sys.argv[2])
+with open(folder / "runs", "a") as file:
+    file.write(stage + " ")
+if stage == "large":
+    raise SystemExit("out of memory")
+text = {"status": "failed" if stage == "job" else "passed", "failures": ["wrong"] if stage == "job" else []}
+(folder / (stage + ".json")).write_text(json.dumps(text))
+""")
+    monkeypatch.setattr(gpu, "ROOT", tmp_path)
+    given = argparse.Namespace(out=tmp_path, again=False, emulate=True, minutes=1.0, sample=None)
+    found = {name: [gpu.run_stage(name, given) for _ in range(2)] for name in ("paper", "job", "large")}
+    assert (tmp_path / "runs").read_text().split() == ["paper", "job", "job", "large", "large"]
+    assert [one["status"] for one in found["paper"]] == ["passed"] * 2
+    assert found["job"][1]["failures"] == ["wrong"]
+    assert found["large"][1]["status"] == "broke off" and "out of memory" in found["large"][1]["failures"][0]
+
+
+@pytest.mark.slow
+def test_stages_run_with_emulated_loops_and_write_what_they_find(tmp_path):
+    """The pair is reconstructed, correlated, and compared with its true displacement."""
+    done = run(tmp_path, "--emulate", "--stage", "paper", "--minutes", "4")
+    assert done.returncode == 0, done.stdout
+    figures = json.loads((tmp_path / "paper.json").read_text())["figures"]
+    copies = figures["copies of two volumes"]
+    assert figures["two volumes [s]"] > 0 and copies["byte to host"] > 0 and len(copies["passes"]) == 2
+
+
+def test_figures_are_written_as_they_are_found(tmp_path):
+    found = gpu_stages.Findings(tmp_path / "paper.json", "paper")
+    found.add("vectors [s]", 0.09)
+    found.require(False, "off by 2 voxel")
+    written = json.loads((tmp_path / "paper.json").read_text())
+    assert written["status"] == "running" and written["figures"] == {"vectors [s]": 0.09}
+    assert written["failures"] == ["off by 2 voxel"]
+
+
+def test_times_of_kernels_are_sorted_and_counters_read(tmp_path):
+    rows = gpu_stages.rows({"forward kernel _sum": [1.0, 3.0], "forward kernel _across": [5.0, 6.0]})
+    assert list(rows) == ["forward kernel _across", "forward kernel _sum"]
+    assert rows["forward kernel _sum"] == {"count": 2, "total_ms": 4.0, "median_ms": 2.0, "largest_ms": 3.0}
+    said = 'noise\n"ID","Metric Name","Metric Unit","Metric Value"\n"0","Duration","ns","12"\n"0","","",""\n'
+    assert gpu_stages.counters(said) == {"Duration [ns]": "12"}
+    (tmp_path / "paper.json").write_text(json.dumps({"figures": {"activities of two volumes": rows}}))
+    assert gpu_stages.slowest_kernels(tmp_path / "paper.json") == ["_across", "_sum"]
