@@ -1,5 +1,6 @@
 """Volumes, vectors and particles for some thirty settings: `python bits.py OUT.npz CORES` stores them as arrays."""
 
+import dataclasses
 import functools
 import os
 import sys
@@ -38,6 +39,7 @@ def rigs():
         "three cameras": Rig((*two, third), options=profiles),
         "four cameras": Rig((*two, third, fourth), options=profiles),
         "unlike light": Rig((two[0], Camera("right", -45.4, light=0.3)), options=profiles),
+        "shared profiles": Rig(two, (20, 32, 32), profiles, voxel_mm=0.06, particles=150),
         "steep": Rig((Camera("left", 20.0), Camera("right", -33.0)), options=profiles),
     }
 
@@ -79,6 +81,12 @@ def measured(rig, **settings):
     return arrays_of([lfpiv.reconstruct(rig.weights, images, **settings) for images in pictures(rig)])
 
 
+def cut_off(rig):
+    """Reconstruct noisy images of a camera that stores no counts below 0."""
+    frames = [{n: np.maximum(image, 0) for n, image in images.items()} for images in pictures(rig, noise=6.0)]
+    return arrays_of([lfpiv.reconstruct(rig.weights, images) for images in frames])
+
+
 def started(rig):
     """Start from a guess of the caller's."""
     first = np.full(rig.shape, 5.0, np.float32)
@@ -107,16 +115,20 @@ def solid(rig):
 
 def correlated(rig, **settings):
     """Correlate volumes that need no reconstruction."""
-    return arrays_of([rig.blobs(2, count=30, moved_voxel=moved) for moved in [(0, 0, 0), MOVED_VOXEL]], **settings)
+    dense = dataclasses.replace(rig, particles=30)
+    return arrays_of([dense.blobs(2, moved_voxel=moved) for moved in [(0, 0, 0), MOVED_VOXEL]], **settings)
 
 
 def cases():
     """Return functions by name; each returns arrays by name."""
     every = rigs()
-    two = every["two cameras"]
+    two, many = every["two cameras"], every["shared profiles"]
     made = {name: functools.partial(measured, rig) for name, rig in every.items()}
     made |= {name: functools.partial(measured, two, **settings) for name, settings in SETTINGS.items()}
     return made | {
+        "shared profiles, no sieve": functools.partial(measured, many, sieve_voxel=0.0),
+        "shared profiles, four subsets": functools.partial(measured, many, subsets=4),
+        "cut-off images": functools.partial(cut_off, every["unlike light"]),
         "masked": functools.partial(measured, two, mask=solid(two)),
         "first guess": functools.partial(started, two),
         "motion": functools.partial(with_motion, two),

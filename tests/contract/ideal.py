@@ -8,7 +8,6 @@ import scipy.sparse
 
 import lfpiv
 
-VOXEL_MM = 0.1
 PITCH_MM = 0.1
 
 
@@ -80,20 +79,25 @@ class Rig:
     shape: tuple[int, int, int] = (8, 12, 12)
     options: dict = field(default_factory=dict)
     """Further arguments of `lfpiv.build_weights`."""
+    voxel_mm: float = 0.1
+    particles: int = 12
 
     @cached_property
     def weights(self):
-        size_mm = tuple(count * VOXEL_MM for count in self.shape[::-1])
-        grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=VOXEL_MM)
+        size_mm = tuple(count * self.voxel_mm for count in self.shape[::-1])
+        grid = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=size_mm, voxel_mm=self.voxel_mm)
         calibration = lfpiv.Calibration({camera.name: camera for camera in self.cameras})
         return lfpiv.build_weights(calibration, grid, **self.options)
 
-    def blobs(self, seed, *, count=12, sigma_voxel=0.8, moved_voxel=(0.0, 0.0, 0.0)):
+    def blobs(self, seed, *, sigma_voxel=0.8, moved_voxel=(0.0, 0.0, 0.0)):
         """Return a volume of Gaussian particles, moved by (x, y, z)."""
         rng = np.random.default_rng(seed)
-        places = rng.uniform(1.5, np.array(self.shape) - 2.5, (count, 3)) + np.array(moved_voxel)[::-1]
-        apart = np.stack(np.indices(self.shape), axis=-1)[..., None, :] - places
-        return (1000 * np.exp(-0.5 * (apart**2).sum(axis=-1) / sigma_voxel**2)).sum(axis=-1).astype(np.float32)
+        places = rng.uniform(1.5, np.array(self.shape) - 2.5, (self.particles, 3)) + np.array(moved_voxel)[::-1]
+        axes = [
+            np.exp(-0.5 * ((np.arange(n) - at[:, None]) / sigma_voxel) ** 2)
+            for n, at in zip(self.shape, places.T, strict=True)
+        ]
+        return 1000 * np.einsum("pz,py,px->zyx", *axes).astype(np.float32)
 
     def cloud(self, seed):
         """Return a volume whose voxels all hold light, unlike in brightness."""

@@ -140,8 +140,8 @@ def test_solids_and_zeros_of_the_guess_stay_dark(rig):
 
 
 def test_particles_are_found_where_they_are():
-    rig = Rig(pair_of_cameras(), options={"form": "profiles"})
-    known = rig.blobs(6, count=8)
+    rig = Rig(pair_of_cameras(), options={"form": "profiles"}, particles=8)
+    known = rig.blobs(6)
     found = smart(rig, rig.images(known, noise=0.5))
     likeness = (found.values * known).sum() / np.linalg.norm(found) / np.linalg.norm(known)
     assert likeness > 0.85
