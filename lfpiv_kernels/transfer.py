@@ -111,6 +111,11 @@ def zeros(size: int, dtype: type = wp.float32) -> wp.array:
     return wp.array(np.zeros(size, wp.dtype_to_numpy(dtype)), dtype=dtype, device="cpu", copy=False)
 
 
+def clear(array: wp.array) -> None:
+    """Set all numbers of a device's array to zero."""
+    array.zero_()
+
+
 def duplicate(array: wp.array) -> wp.array:
     """Return a copy on the same device; on the CPU it is memory of NumPy."""
     if runtime.device().form == "gpu":

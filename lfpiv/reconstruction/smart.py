@@ -23,7 +23,7 @@ from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.reconstruction.voxels import darken
 from lfpiv_kernels.replay import Replay
-from lfpiv_kernels.transfer import DeviceArray, empty, zeros
+from lfpiv_kernels.transfer import DeviceArray, clear, empty, zeros
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class ImageEquations:
 
     def _find_exponent(self, parts: Sequence[tuple[int, int]], volume: DeviceArray, exponent: DeviceArray) -> None:
         """Write what `exponent_of` returns."""
-        exponent.zero_()
+        clear(exponent)
         for camera, ray_set in parts:
             self.compare_part(camera, ray_set, volume)
             self._gather(camera, ray_set, volume, exponent)
