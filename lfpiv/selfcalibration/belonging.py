@@ -237,8 +237,13 @@ class Judgement:
     def fits(self) -> bool:
         """Whether the images fit clearly better than by chance, and than those of other cameras and mirrored ones.
 
-        The order of frames does not count, since particles that hardly move fit in either order.
+        Each frame beats chance, too. The order of frames does not count, since particles that hardly move fit in either
+        order.
         """
+        for one in self.chance:
+            both = zip(self.left[RIGHT], self.left.get(one, ()), strict=False)
+            if min((advantage([mine], [others]) for mine, others in both), default=SURE) < SURE:
+                return False
         wrong = [one for one in self.tried if one.kind not in IN_TIME]
         return not self.mistakes and self.over_chance > CLEAR and all(self.margin(one) > SURE for one in wrong)
 
@@ -277,8 +282,9 @@ def judge(
 ) -> Judgement:
     """Judge the images of a pair.
 
-    The first frame and the likely mistakes are tried first. Where only the order of frames is in doubt, it is tried in
-    the second frame, too. Other doubts are followed by all mistakes and both frames.
+    The first frame and the likely mistakes are tried first, and chance in the second frame of a pair. Where only the
+    order of frames is in doubt, it is tried in the second frame, too. Other doubts are followed by all
+    mistakes and both frames.
 
     Parameters
     ----------
@@ -318,10 +324,14 @@ def judge(
         chance = [Mistake(Kind.CHANCE, (name,)) for name in cameras]
     likely = [RIGHT, *chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
     found = try_frames(likely, 1)
-    if found.in_order and not thorough:
-        return found
     ordering = [one for one in likely if one is RIGHT or one.kind is Kind.FRAMES]
-    if found.fits and not thorough:
+    if found.in_order and not thorough:
+        if not images:
+            return found
+        found = try_frames([RIGHT, chance[0]], 2)  # the second frame of a pair is that of no other one
+        if found.fits:
+            return found
+    elif found.fits and not thorough:
         found = try_frames(ordering, 2)
         each = [advantage(left[RIGHT][at : at + 1], left[one][at : at + 1]) for one in ordering[1:] for at in (0, 1)]
         if found.fits and min(each) > -SURE:
