@@ -14,6 +14,9 @@ from functools import reduce
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from lfpiv.reconstruction.recording import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts
@@ -31,6 +34,8 @@ TRIED = 3
 """Largest number of pairs that are judged. One is enough if its images fit each other clearly."""
 LEAST_FOR_NOTHING = 2
 """Least number of pairs without common particles that a refusal of them needs."""
+UNLIKE_SCALES = 8.0
+"""Ratio of the cameras' counts from which on the log states it: scattering angles and apertures hardly make more."""
 NEIGHBOURS = (1, -1, 2, -2)
 """Pairs, or instants, by which a camera may be late."""
 FARTHEST = 10
@@ -61,6 +66,8 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     tried = list(islice(experiment.disjoint(dict.fromkeys(order)), TRIED))
     shown = ShownParticles(experiment, weights.cameras, tried)
     judged = _judge(shown if len(tried) > 1 else replace(shown, pairs=()), tried, weights)
+    for light in islice(_light(shown, judged), 1):
+        _log_scales(light[0])
     refusals = _refusals(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, shown, weights, list(judged))
@@ -122,6 +129,18 @@ def _dark_warnings(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[
         )
         for part in dark_parts.find(weights, pairs)
     ]
+
+
+def _log_scales(images: Images) -> None:
+    """Log how far the counts of the cameras differ, if it is much. Up to 1 / `DIMMEST` vectors do not depend on it."""
+    light = {name: float(np.mean(image, dtype=float)) for name, image in images.items()}
+    bright, dim = max(light, key=light.__getitem__), min(light, key=light.__getitem__)
+    if light[dim] > 0 and (ratio := light[bright] / light[dim]) >= UNLIKE_SCALES:
+        text = f"cameras: the images of {bright} have {ratio:.0f} times the counts of {dim}"
+        if ratio * DIMMEST < 1:
+            log.info("%s; the scale of each camera is divided out", text)
+        else:
+            log.warning("%s, more than can be divided out: store the images of both on one scale", text)
 
 
 def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:

@@ -5,6 +5,7 @@ import types
 
 import numpy as np
 import pytest
+import tifffile
 import xarray as xr
 
 import lfpiv
@@ -89,6 +90,18 @@ def test_one_camera_cannot_be_checked_and_that_is_said(rig):
     experiment, weights = rig
     found = belonging.check(experiment, weights.of_camera("left"), [0])
     assert "one camera" in found.sentence and not found.refusals
+
+
+def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_path, caplog):
+    file = small_run.images(tmp_path / "data")
+    for path in (file.parent / "particles" / "left").iterdir():
+        image = tifffile.imread(path)
+        tifffile.imwrite(path, np.minimum(image.astype(np.uint32) * 16, 65535).astype(np.uint16))
+    with caplog.at_level("INFO", "lfpiv"):
+        found = belonging.check(lfpiv.open_experiment(file), rig[1], [0])
+    assert not found.refusals
+    (said,) = [text for text in caplog.messages if "times the counts of right" in text]
+    assert 12 < float(said.split(" have ")[1].split()[0]) < 20  # the cameras are not equally bright
 
 
 def test_a_pair_whose_frames_are_exchanged_in_one_camera_is_refused(small_run, tmp_path, empty_report):
