@@ -87,6 +87,8 @@ def test_wrong_folders_and_formats_are_named(run, tmp_path):
             call(empty)
     with pytest.raises(lfpiv.InputError, match=r"nothing\.toml"):
         lfpiv.open_experiment(tmp_path / "nothing.toml")
+    with pytest.raises(lfpiv.InputError, match="empty"):
+        lfpiv.open_experiment(empty)
     with pytest.raises((lfpiv.InputError, ValueError), match="docx"):
         lfpiv.export_results(run.out, "docx")
 
