@@ -24,6 +24,24 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     assert path.read_text() == old and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(("write", "content"), [("write_bytes", b"new"), ("write_text", "new"), ("write_json", "new")])
+def test_a_written_file_appears_at_once_and_whole(tmp_path, monkeypatch, write, content):
+    """A process that ends before the new file takes the old one's place leaves the old one."""
+
+    def end(*_):
+        raise OSError("the process ended")
+
+    path = tmp_path / "file"
+    path.write_text("old")
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", end)
+        with pytest.raises(OSError):
+            getattr(files, write)(content, path)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    getattr(files, write)(content, path)
+    assert "new" in path.read_text()
+
+
 def test_settings_hash_sees_every_value_and_no_order():
     settings = Smart().model_dump()
     hashes = {files.settings_hash(smart=settings), files.settings_hash(smart=dict(reversed(settings.items())))}
