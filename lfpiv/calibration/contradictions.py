@@ -85,10 +85,9 @@ def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
         mistake = likely_mistake(signals, decoder, board, setup.orientation)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake
-    if not found:
-        return None
     sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]
-    return f"{experiment.path}: " + " ".join(sentence for sentence in sentences if sentence)
+    text = " ".join(sentence for sentence in sentences if sentence)
+    return f"{experiment.path}: {text}" if text else None
 
 
 def _exchanged(experiment: Experiment, found: Mapping[str, Mistake], decoders: Mapping[str, LightFieldDecoder]) -> str:
@@ -112,7 +111,14 @@ def _exchanged(experiment: Experiment, found: Mapping[str, Mistake], decoders: M
 
 
 def _planes(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
-    """Name planes with a wrong order or sign of their depths; "" without any."""
+    """Name planes with a wrong order, sign or size of their depths; "" without any."""
+    stretches = {mistake.stretch for mistake in found.values()}
+    if len(found) == len(experiment.cameras) and len(stretches) == 1 and stretches != {1.0}:
+        depths = ", ".join(f"{z:.4g}" for z in next(iter(found.values())).depths_mm(experiment.board.planes_mm))
+        return (
+            f"board.planes_mm: the dots come into focus as if the planes were {stretches.pop():.3g} times as far apart "
+            f"as stated. Check the unit, which is the millimetre; planes_mm = [{depths}] would fit."
+        )
     names = [name for name, mistake in found.items() if mistake.planes]
     if not names:
         return ""

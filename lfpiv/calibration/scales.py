@@ -35,7 +35,7 @@ EXPLAINED = 0.3
 FLATTEST = 0.1
 """Least squared sine of a camera's angle to z; others hardly see planes sideways."""
 DEEPEST = 0.15
-"""Difference of the planes' scale from 1 above which a liquid is the likely cause, see `Code.MEDIUM`."""
+"""Planes closer together by more than this share are the sign of a liquid, see `Code.MEDIUM`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ def check_scales(experiment: Experiment, cameras: Sequence[CameraLabels]) -> Non
     spacing = abs(found.dots * found.planes - 1) < off / 2  # a wrong spacing explains the magnification, too
     sure = off > SIGNIFICANT * found.planes_std
     sure |= spacing and off > SURE_BOTH * found.planes_std and abs(found.dots - 1) > SIGNIFICANT * found.dots_std
-    if found.explained and sure and CONTRADICTION < off < DEEPEST:
+    if found.explained and sure and off > CONTRADICTION and found.planes > 1 - DEEPEST:
         remedy = (
             f"board.spacing_mm = {experiment.board.spacing_mm * found.dots:.4g} would fit both"
             if spacing

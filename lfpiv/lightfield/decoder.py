@@ -109,8 +109,9 @@ class LightFieldDecoder:
         if not plateau > _LEAST_SIGNAL * sigma or plateau <= 0:
             raise InputError(
                 f"white: expected microimages brighter than the gaps between them, found {plateau:.3g} counts above a "
-                f"background with noise {sigma:.3g}. Check that the image was lit and belongs to this camera, and "
-                "f_number and microlens_focal_length_mm: light fills the gaps if microimages are wider than they imply."
+                f"background with noise {sigma:.3g}. Check that the image was lit and belongs to this camera; then "
+                "f_number, microlens_focal_length_mm, and pixel_um together with microlens_pitch_mm: light fills the "
+                "gaps if microimages are wider than they imply."
             )
         gain, smooth_gain = _gains(signal / np.float32(plateau), coverage, lens_index, offset_mm, optics)
         return cls(

@@ -153,6 +153,8 @@ def test_a_wrongly_named_dot_is_left_out(rig):
 
 MISTAKES = {
     "planes": r"Set planes_mm = \[-",
+    "unit": r"planes were 10 times as far apart as stated",
+    "depths": r"planes were 0.1 times as far apart as stated",
     "angle": r'cameras? .only. are mirrored left to right .*Set image_flip = "horizontal"',
     "ordinary": r'Change the sign of nominal_angle_deg .*where x is meant.*board.axes = "left-handed"',
 }
@@ -165,6 +167,9 @@ def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
     turned = Orientation(-camera.orientation.yaw_deg)
     if mistake == "planes":
         board = board.model_copy(update={"planes_mm": tuple(-z for z in board.planes_mm)})
+    elif mistake in ("unit", "depths"):
+        stretch = {"unit": 0.1, "depths": 10.0}[mistake]
+        board = board.model_copy(update={"planes_mm": tuple(stretch * z for z in board.planes_mm)})
     elif mistake == "angle":
         camera = dataclasses.replace(camera, orientation=turned)
     else:  # the stored pictures are read as they are, as if a flip had made them so

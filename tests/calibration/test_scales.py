@@ -42,7 +42,7 @@ def test_right_scales_raise_nothing(angles):
     assert not told(angles, (1, 1, 1))
 
 
-@pytest.mark.parametrize(("wrong", "angles"), [(1.08, (40.0, -40.0)), (0.93, (-45.0,))])
+@pytest.mark.parametrize(("wrong", "angles"), [(1.08, (40.0, -40.0)), (0.93, (-45.0,)), (0.8, (40.0, -40.0))])
 def test_the_scale_of_the_stage_is_told(wrong, angles):
     (warning,) = told(angles, (1, 1, wrong))
     assert warning.code is Code.SCALES and "scale of the stage" in warning.sentence

@@ -1,4 +1,5 @@
-"""Try mistakes that leave a board's dots unlike what the stated rig shows: mirrored pictures, planes in another order.
+"""Try mistakes that leave a board's dots unlike what the stated rig shows: mirrored pictures, planes in another order
+or further apart.
 
 A camera whose pictures are mirrored sees the board as a camera with a mirror image of its orientation. So a mistake is
 another nominal rotation, or other depths of the planes. Where the dots are in focus and lie on the lattice in all
@@ -23,6 +24,9 @@ CLEAR = 1.05
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
 
+STRETCHES = (0.1, 0.5, 2.0, 10.0, 1 / 25.4, 25.4)
+"""Depths of the planes over the stated ones, if these are in another unit, or are half or twice the distances."""
+
 _BOARD_MIRRORS = [np.diag([a, b, 1.0]) for a in (1, -1) for b in (1, -1)]
 
 
@@ -36,6 +40,8 @@ class Mistake:
     """Pictures are upside down."""
     planes: str = ""
     """"", or "reversed" or "negated": the order or the sign of the depths."""
+    stretch: float = 1.0
+    """The depths over the stated ones."""
 
     @property
     def mirror(self) -> np.ndarray:
@@ -44,7 +50,8 @@ class Mistake:
 
     def depths_mm(self, planes_mm: tuple[float, ...]) -> tuple[float, ...]:
         """Return the depths of the planes [mm]."""
-        return {"": planes_mm, "reversed": planes_mm[::-1], "negated": tuple(-z for z in planes_mm)}[self.planes]
+        depths = tuple(self.stretch * z for z in planes_mm)
+        return {"": depths, "reversed": depths[::-1], "negated": tuple(-z for z in depths)}[self.planes]
 
 
 RIGHT = Mistake()
@@ -70,7 +77,8 @@ def mistakes(orientation: Orientation, planes_mm: tuple[float, ...]) -> list[Mis
     orders: dict[tuple[float, ...], str] = {}
     for planes in ("", "reversed", "negated"):
         orders.setdefault(Mistake(planes=planes).depths_mm(planes_mm), planes)
-    return [replace(mirror, planes=planes) for planes in orders.values() for mirror in mirrors]
+    stretched = [Mistake(stretch=stretch) for stretch in STRETCHES] if any(planes_mm) else []
+    return [replace(mirror, planes=planes) for planes in orders.values() for mirror in mirrors] + stretched
 
 
 def contrast(
