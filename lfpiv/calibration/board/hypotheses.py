@@ -1,5 +1,4 @@
-"""Try mistakes that leave a board's dots unlike what the stated rig shows: mirrored pictures, planes in another order
-or further apart.
+"""Try mistakes that leave a board's dots unlike what the stated rig shows: mirrored pictures, planes elsewhere.
 
 A camera whose pictures are mirrored sees the board as a camera with a mirror image of its orientation. So a mistake is
 another nominal rotation, or other depths of the planes. Where the dots are in focus and lie on the lattice in all
