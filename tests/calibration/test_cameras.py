@@ -420,7 +420,7 @@ def test_wrong_arguments_are_named(rig, tmp_path):
     with pytest.raises(lfpiv.InputError, match="could not read it"):
         lfpiv.load_calibration(tmp_path / "missing.h5")
     (tmp_path / "damaged.h5").write_bytes(b"no calibration")
-    with pytest.raises(lfpiv.InputError, match=r"damaged one \(it is no HDF5 file\)\. Calibrate again"):
+    with pytest.raises(lfpiv.InputError, match=r"damaged one \(it has no seal.*\)\. Calibrate again"):
         lfpiv.load_calibration(tmp_path / "damaged.h5")
 
 

@@ -33,26 +33,22 @@ def counted(self, *arguments, **options):
 
 wp.array.__init__ = counted
 
+import numpy as np
+
 import lfpiv
-from lfpiv.experiment.opening import read_experiment
-from lfpiv.planning import part
 from lfpiv.weights.device_share import BASE_BYTES, beside_bytes
 from lfpiv_kernels import runtime
 
 assert runtime.start("cpu").form == "gpu"
-experiment = read_experiment(sys.argv[1])
-whole = part.Volume(
-    experiment=experiment,
-    guard=((1, 1),) * 3,
-    refinement=1.0,
-    calibration=lfpiv.thin_lens(experiment),
-    particle_voxel=0.9,
-)
-forms = whole.forms()
+experiment = lfpiv.open_experiment(sys.argv[1])
+calibration, grid = lfpiv.thin_lens(experiment), experiment.grid
+built = lfpiv.build_weights(calibration, grid, particle_voxel=0.9)
+weights = sum(built.projector(name).device_bytes for name in built.cameras)
 peak = alive
-part.measure(whole, forms, whole.per_voxel())
-weights = sum(form.device_bytes for form in forms.values())
-needed = weights + beside_bytes(whole.cameras.values(), whole.finest.grid) - BASE_BYTES
+images = [built(np.random.default_rng(seed).random(grid.shape, np.float32)) for seed in (1, 2)]
+volumes = [lfpiv.reconstruct(built, one) for one in images]
+lfpiv.correlate(*volumes)
+needed = weights + beside_bytes(calibration.cameras.values(), grid) - BASE_BYTES
 print(json.dumps({"peak": peak, "weights": weights, "needed": needed}))
 """
 
