@@ -67,10 +67,10 @@ def warn_unstated(experiment: Experiment) -> None:
         warn(log, Warning(code=Code.FLIP_UNSTATED, figures=figures))
 
 
-def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
+def cause(experiment: Experiment, decoder_of: Decoders, *, lost: bool = False) -> str | None:
     """Name the mistake that explains all board images better than the stated rig, as a message; None without one.
 
-    A board with a mark names its dots by itself and is left out.
+    A board with a mark names its dots by itself and is left out. `lost` says that the dots of a camera were not found.
     """
     if experiment.board.mark:
         return None
@@ -82,7 +82,7 @@ def cause(experiment: Experiment, decoder_of: Decoders) -> str | None:
             continue
         decoders[setup.name] = decoder = decoder_of(setup)
         signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
-        mistake = likely_mistake(signals, decoder, board, setup.orientation)
+        mistake = likely_mistake(signals, decoder, board, setup.orientation, lost=lost)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake
     sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]

@@ -112,15 +112,15 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
     checks.check_light(experiment, setup, sensor.decoder, images, dark)
 
-    def cause() -> str | None:
+    def cause(*, lost: bool = False) -> str | None:
         with collected(quiet=True):
-            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder)
+            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder, lost=lost)
 
     try:
         dots = _measure_dots(experiment, setup, sensor.decoder, images)
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     except InputError as error:
-        raise InputError(cause() or str(error)) from None
+        raise InputError(cause(lost=True) or str(error)) from None
     if contradictions.doubtful(setup, dots, lens) and (text := cause()):
         raise InputError(text)
     step(1.0)

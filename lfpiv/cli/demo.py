@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lfpiv.errors import InputError
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.results import netcdf
@@ -44,8 +45,11 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
         If the folder cannot be written.
     """
     out, report = Path(out), progress or ignore_progress
-    if device is not None:
-        runtime.start(device)  # before the simulation, which takes any device
+    if device is not None:  # before the simulation, which takes any device
+        try:
+            runtime.start(device)
+        except (RuntimeError, ValueError) as error:
+            raise InputError(str(error)) from None
     with importlib.resources.as_file(importlib.resources.files("lfpiv.cli") / "demo_scene.toml") as path:
         scene = open_scene(path)
         experiment = out / "experiment" / "experiment.toml"

@@ -176,12 +176,15 @@ def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
         camera = dataclasses.replace(camera, orientation=turned, stated_flip="horizontal")
     wrong = dataclasses.replace(experiment, board=board, cameras=(camera,))
     decoder = calibration.cameras["only"].decoder
-    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder))
+    lost = mistake == "depths"
+    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, lost=lost))
 
 
 def test_what_is_right_has_no_mistake(rig):
     experiment, _, calibration = rig
-    assert contradictions.cause(experiment, lambda setup: calibration.cameras["only"].decoder) is None
+    decoder = calibration.cameras["only"].decoder
+    for lost in (False, True):
+        assert contradictions.cause(experiment, lambda setup: decoder, lost=lost) is None
 
 
 @pytest.mark.slow

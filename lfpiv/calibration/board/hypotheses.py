@@ -76,8 +76,7 @@ def mistakes(orientation: Orientation, planes_mm: tuple[float, ...]) -> list[Mis
     orders: dict[tuple[float, ...], str] = {}
     for planes in ("", "reversed", "negated"):
         orders.setdefault(Mistake(planes=planes).depths_mm(planes_mm), planes)
-    stretched = [Mistake(stretch=stretch) for stretch in STRETCHES] if any(planes_mm) else []
-    return [replace(mirror, planes=planes) for planes in orders.values() for mirror in mirrors] + stretched
+    return [replace(mirror, planes=planes) for planes in orders.values() for mirror in mirrors]
 
 
 def contrast(
@@ -97,10 +96,14 @@ def contrast(
 
 
 def likely_mistake(
-    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation
+    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation, *, lost: bool = False
 ) -> Mistake | None:
-    """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly."""
+    """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly.
+
+    Planes closer together are tried only where dots are `lost`: a liquid makes a right board look less deep.
+    """
     tried = mistakes(orientation, board.planes_mm)
+    tried += [Mistake(stretch=stretch) for stretch in STRETCHES if lost or stretch > 1]
     found = [contrast(signals, decoder, board, orientation, mistake) for mistake in tried]
     best = int(np.argmax(found))
     if not found[best]:
