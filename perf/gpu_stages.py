@@ -451,7 +451,7 @@ def measure_pair(job: Job, pair: Pair, pairs: int) -> Any:
 
 
 def paper(job: Job) -> None:
-    """Measure a pair of the published size, 20 pairs in a row, and the count of its rays."""
+    """Measure a pair of the published size, and 20 pairs in a row."""
     from lfpiv_kernels import runtime
 
     runtime.start(device())
@@ -610,7 +610,7 @@ def main() -> int:
     parser.add_argument("--scale", choices=("tiny", "medium", "paper"), default="paper")
     parser.add_argument("--minutes", type=float, default=8.0)
     parser.add_argument("--sample", type=Path, help="folder with the sample experiment")
-    parser.add_argument("--edge", type=int, default=32, help="voxels of the edge of `cube`")
+    parser.add_argument("--edge", type=int, default=32, help="voxels of an edge of `cube`; threads of `frame`")
     given = parser.parse_args()
     found = Findings(given.folder / f"{given.stage}.json", given.stage)
     job = Job(found, given.scale, time.monotonic() + 60 * given.minutes, given.sample)

@@ -25,7 +25,7 @@ from lfpiv.reconstruction.beyond import light_beyond
 from lfpiv.reconstruction.refinement import measure_size
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes
-from lfpiv.runs import background, belonging, memory, pair_figures
+from lfpiv.runs import background, belonging, pair_figures, rig
 from lfpiv.runs.frame_light import SAMPLED, FrameLight, frame_light, read_darks
 from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.runs.pair_volumes import Reconstructor
@@ -33,7 +33,6 @@ from lfpiv.runs.run import Run
 from lfpiv.selfcalibration.disparity import CameraVolumes
 from lfpiv.warn import collected
 from lfpiv.weights.checks import compare_with_count
-from lfpiv.weights.operator import build_weights
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -123,18 +122,7 @@ def measure(run: Run, calibration: Calibration, scratch: Path, *, calibrated: bo
 
 def _weights(run: Run, calibration: Calibration) -> Weights:
     """Build the weights and check them as a run does."""
-    compute, finest = run.experiment.compute, run.reconstructed_experiment
-    built = build_weights(
-        calibration,
-        finest.grid,
-        compute.weights,
-        form=compute.weights_form,
-        particle_voxel=run.particle_voxel,
-        rays=compute.count_rays,
-        limit_bytes=memory.left_for_weights(finest),
-    )
-    built.volume = run.experiment.grid
-    _ = built.camera_sums
+    built = rig.weights_of(run, calibration)
     compare_with_count(built)
     return built
 

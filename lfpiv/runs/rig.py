@@ -32,6 +32,7 @@ from lfpiv.warn import Code, Warning, collected, warn
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
     from lfpiv.experiment.experiment import Experiment
+    from lfpiv.progress import StepProgress
     from lfpiv.runs.run import Run
     from lfpiv.weights.operator import Weights
 
@@ -205,13 +206,32 @@ def tell_vectors(experiment: Experiment) -> None:
         log.warning("%s", warning.sentence)
 
 
+def weights_of(run: Run, calibration: Calibration, progress: StepProgress | None = None) -> Weights:
+    """Build the weights of the voxels that a run reconstructs, with the sums that all pairs and workers share."""
+    from lfpiv.weights.operator import build_weights
+
+    compute, finest = run.experiment.compute, run.reconstructed_experiment
+    weights = build_weights(
+        calibration,
+        finest.grid,
+        compute.weights,
+        form=compute.weights_form,
+        particle_voxel=run.particle_voxel,
+        rays=compute.count_rays,
+        limit_bytes=memory.left_for_weights(finest),
+        progress=progress,
+    )
+    weights.volume = run.experiment.grid
+    _ = weights.camera_sums
+    return weights
+
+
 def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
     """Build the weights and check the cameras by the first pairs of `todo`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.checks import compare_with_count
-    from lfpiv.weights.operator import build_weights
 
-    experiment, compute, finest = run.experiment, run.experiment.compute, run.reconstructed_experiment
+    experiment, compute = run.experiment, run.experiment.compute
     calibration, self_calibration = prepared.calibration, prepared.self_calibration
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
@@ -223,18 +243,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
     with collected() as warnings:
         for warning in self_calibration.warnings if self_calibration else ():
             warn(log, warning)
-        weights = build_weights(
-            calibration,
-            finest.grid,
-            compute.weights,
-            form=compute.weights_form,
-            particle_voxel=run.particle_voxel,
-            rays=compute.count_rays,
-            limit_bytes=memory.left_for_weights(finest),
-            progress=run.step("weights"),
-        )
-        weights.volume = experiment.grid
-        _ = weights.camera_sums  # computed here, once for all pairs and workers
+        weights = weights_of(run, calibration, run.step("weights"))
         seconds = time.perf_counter() - start
         counted = compare_with_count(weights)
         agreement = belonging.check(experiment, weights, todo)
