@@ -120,7 +120,7 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     worker_plan.require_memory(finest, estimated, 1)
     need = memory_of(run, estimated, workers)
     if need.device_streamed:
-        assumptions.append("the weights that a pass copies to the GPU are those of this process alone")
+        assumptions.append("one process alone copies weights to the GPU in each pass")
     step(0.1)
     prepared = {} if calibrated else board_cost(experiment, calibration, assumptions)
     first = measure(run, calibration, scratch, calibrated=calibrated)
@@ -208,7 +208,7 @@ def _with_voxels(run: Run, assumptions: list[str]) -> Run:
 
 
 def memory_of(run: Run, weights: int, workers: int) -> Memory:
-    """Estimate the memory for weights of a size [byte]; refuse a volume that cannot fit into that of the GPU."""
+    """Estimate the memory for weights of a size [byte]; refuse a volume that cannot fit into the GPU."""
     finest = run.reconstructed_experiment
     free = runtime.free_bytes()
     streamed, whole, least = 0, None, None

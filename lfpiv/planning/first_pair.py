@@ -169,7 +169,7 @@ def _simulated(weights: Weights, shape: tuple[int, int, int]) -> list[dict[str, 
 def _images_cost(
     experiment: Experiment, calibration: Calibration, light: tuple[FrameLight, FrameLight], read: Cost
 ) -> Cost:
-    """Return the cost of what a run finds in its images before the weights; `read` is that of reading a frame."""
+    """Return the cost of what a run finds in its images before the weights; `read` is the cost of reading a frame."""
     images, size = [one.images for one in light], NOTHING
     _, beyond = timed(lambda: light_beyond(calibration, experiment.grid, [images]))
     if experiment.smart.refinement == "auto":

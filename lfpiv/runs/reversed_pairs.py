@@ -25,7 +25,7 @@ FEW = 0.1
 def reversed_pairs(figures: Mapping[int, PairFigures]) -> list[Warning]:
     """Return the warning about pairs whose flow runs against that of the others; empty without any.
 
-    `figures` are those of the pairs with vectors.
+    `figures` belong to the pairs with vectors.
     """
     likeness = _likeness(evenly_spread(list(figures), MOST), figures)
     if len(likeness) < 2 or np.median(np.abs(list(likeness.values()))) < ALIKE:

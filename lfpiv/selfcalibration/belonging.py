@@ -328,7 +328,7 @@ def judge(
     if found.in_order and not thorough:
         if not images:
             return found
-        found = try_frames([RIGHT, chance[0]], 2)  # the second frame of a pair is that of no other one
+        found = try_frames([RIGHT, chance[0]], 2)  # no other pair has this second frame
         if found.fits:
             return found
     elif found.fits and not thorough:

@@ -24,7 +24,7 @@ STANDS_OUT = 2.0
 CELLS = 12
 """Largest number of cells along each edge of the region of a sensor that sees the volume."""
 DARK = 0.25
-"""Largest root of a dark region's light, over that of the light expected there."""
+"""Largest root of a dark region's light, over the root of the expected light."""
 LEAST_SHARE = 0.1
 """Least share of a sensor's expected light in a dark region, both as roots."""
 LARGEST_SHARE = 0.75
