@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -22,6 +22,10 @@ log = logging.getLogger(__name__)
 
 COMPLETE = 0.9
 """Part of the expected dots that a complete board shows."""
+STRETCHES = (0.1, 0.5, 2.0, 10.0, 1 / 25.4, 25.4)
+"""Depths of the planes over the stated ones, if these are in another unit, or are half or twice the distances."""
+WIDER, NARROWER = 1.25, 0.6
+"""Aperture over the stated one if planes are twice or half as far apart: 1.40 and 0.42 were found, water shows 0.75."""
 PUPIL_SCALE = 0.05
 """Difference of the fitted pupil scale from 1 above which depth and defocus of the dots may contradict each other."""
 FITTED_PITCH = 0.1
@@ -67,10 +71,10 @@ def warn_unstated(experiment: Experiment) -> None:
         warn(log, Warning(code=Code.FLIP_UNSTATED, figures=figures))
 
 
-def cause(experiment: Experiment, decoder_of: Decoders, *, lost: bool = False) -> str | None:
+def cause(experiment: Experiment, decoder_of: Decoders, stretches: Sequence[float] = ()) -> str | None:
     """Name the mistake that explains all board images better than the stated rig, as a message; None without one.
 
-    A board with a mark names its dots by itself and is left out. `lost` says that the dots of a camera were not found.
+    A board with a mark names its dots by itself and is left out. `stretches` are those of `likely_stretches`.
     """
     if experiment.board.mark:
         return None
@@ -82,12 +86,23 @@ def cause(experiment: Experiment, decoder_of: Decoders, *, lost: bool = False) -
             continue
         decoders[setup.name] = decoder = decoder_of(setup)
         signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
-        mistake = likely_mistake(signals, decoder, board, setup.orientation, lost=lost)
+        mistake = likely_mistake(signals, decoder, board, setup.orientation, stretches=stretches)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake
     sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]
     text = " ".join(sentence for sentence in sentences if sentence)
     return f"{experiment.path}: {text}" if text else None
+
+
+def likely_stretches(lens: ThinLensModel | None) -> list[float]:
+    """Return the depths of the planes over the stated ones that dots may show: those of other units, a half and twice.
+
+    `lens` is the camera fitted to its dots, None if they were not found. Planes that are further apart than stated
+    look as through a wider aperture.
+    """
+    if lens is None:
+        return list(STRETCHES)
+    return [one for one in STRETCHES if (lens.pupil_scale > WIDER if one > 1 else lens.pupil_scale < NARROWER)]
 
 
 def _exchanged(experiment: Experiment, found: Mapping[str, Mistake], decoders: Mapping[str, LightFieldDecoder]) -> str:

@@ -112,16 +112,18 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
     checks.check_light(experiment, setup, sensor.decoder, images, dark)
 
-    def cause(*, lost: bool = False) -> str | None:
+    def cause(lens: ThinLensModel | None) -> str | None:
         with collected(quiet=True):
-            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder, lost=lost)
+            return contradictions.cause(
+                experiment, lambda one: decode(experiment, one).decoder, contradictions.likely_stretches(lens)
+            )
 
     try:
         dots = _measure_dots(experiment, setup, sensor.decoder, images)
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     except InputError as error:
-        raise InputError(cause(lost=True) or str(error)) from None
-    if contradictions.doubtful(setup, dots, lens) and (text := cause()):
+        raise InputError(cause(None) or str(error)) from None
+    if contradictions.doubtful(setup, dots, lens) and (text := cause(lens)):
         raise InputError(text)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens)

@@ -55,13 +55,15 @@ def check(experiment: Experiment | str | Path, out: str | Path, *, progress: Pro
     """
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    views = []
+    views, stretches = [], []
     with collected(quiet=True):  # a calibration says them again
         for number, setup in enumerate(experiment.cameras):
-            views.append(_view(experiment, setup))
+            view, found = _view(experiment, setup)
+            views.append(view)
+            stretches = stretches if found else contradictions.likely_stretches(None)
             if progress is not None:
                 progress("board", (number + 1) / len(experiment.cameras))
-        contradiction = contradictions.cause(experiment, lambda setup: decode(experiment, setup).decoder)
+        contradiction = contradictions.cause(experiment, lambda setup: decode(experiment, setup).decoder, stretches)
     said = f"in the recorded pictures {axes.directions(experiment)}; {axes.handedness(experiment)}"
     picture = Path(out) / "check" / "board.png"
     with writing(picture):
@@ -70,17 +72,18 @@ def check(experiment: Experiment | str | Path, out: str | Path, *, progress: Pro
     return {"picture": str(picture), "axes": said, "contradiction": contradiction}
 
 
-def _view(experiment: Experiment, setup: CameraSetup) -> BoardView:
-    """Return what one camera shows of the plane nearest to z = 0."""
+def _view(experiment: Experiment, setup: CameraSetup) -> tuple[BoardView, bool]:
+    """Return what one camera shows of the plane nearest to z = 0, and whether its dots were found."""
     decoder, board = decode(experiment, setup).decoder, DotBoard.from_settings(experiment.board)
     signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
     plane = int(planes_from_middle(board)[0])
+    found = True
     try:
         pose = find_board(signals, decoder, board, setup.orientation).pose
     except InputError:
         if setup.orientation is None:
             raise
-        pose = CameraPose.from_plan(decoder.optics, setup.orientation)
+        found, pose = False, CameraPose.from_plan(decoder.optics, setup.orientation)
     z_mm, signal = board.planes_mm[plane], signals.of_plane(plane)
     rectified = rectifier(decoder, board)(signal, pose, z_mm)
     reach = board.spacing_mm * (max(board.dots) - 1) / 2
@@ -91,7 +94,7 @@ def _view(experiment: Experiment, setup: CameraSetup) -> BoardView:
     for axis, n in ((0, columns), (1, rows)):
         if flip[1 - axis].step == -1:
             on_sensor[:, axis] = n - 1 - on_sensor[:, axis]
-    return BoardView(
+    view = BoardView(
         camera=setup.name,
         plane=plane,
         z_mm=z_mm,
@@ -104,3 +107,4 @@ def _view(experiment: Experiment, setup: CameraSetup) -> BoardView:
         bin_mm=rectified.bin_mm,
         reach_mm=reach,
     )
+    return view, found

@@ -5,6 +5,7 @@ import json
 import logging
 import re
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -176,15 +177,21 @@ def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
         camera = dataclasses.replace(camera, orientation=turned, stated_flip="horizontal")
     wrong = dataclasses.replace(experiment, board=board, cameras=(camera,))
     decoder = calibration.cameras["only"].decoder
-    lost = mistake == "depths"
-    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, lost=lost))
+    aperture = {"unit": 1.4, "depths": 0.4}.get(mistake, 1.0)  # as a camera fitted to wrong depths shows it
+    stretches = contradictions.likely_stretches(SimpleNamespace(pupil_scale=aperture))
+    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, stretches))
 
 
 def test_what_is_right_has_no_mistake(rig):
     experiment, _, calibration = rig
     decoder = calibration.cameras["only"].decoder
-    for lost in (False, True):
-        assert contradictions.cause(experiment, lambda setup: decoder, lost=lost) is None
+    for stretches in ([], contradictions.likely_stretches(None)):
+        assert contradictions.cause(experiment, lambda setup: decoder, stretches) is None
+
+
+def test_no_depths_are_doubted_where_the_dots_show_the_stated_aperture():
+    for aperture in (0.75, 1.0, 1.1):  # a liquid shows the first
+        assert not contradictions.likely_stretches(SimpleNamespace(pupil_scale=aperture))
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ planes, their contrast is high. The mistake with the clearly highest contrast fi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +23,6 @@ CLEAR = 1.05
 """Least ratio of light by which a mistake must surpass what is stated."""
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
-
-STRETCHES = (0.1, 0.5, 2.0, 10.0, 1 / 25.4, 25.4)
-"""Depths of the planes over the stated ones, if these are in another unit, or are half or twice the distances."""
 
 _BOARD_MIRRORS = [np.diag([a, b, 1.0]) for a in (1, -1) for b in (1, -1)]
 
@@ -96,14 +94,19 @@ def contrast(
 
 
 def likely_mistake(
-    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation, *, lost: bool = False
+    signals: Signals,
+    decoder: LightFieldDecoder,
+    board: DotBoard,
+    orientation: Orientation,
+    *,
+    stretches: Sequence[float] = (),
 ) -> Mistake | None:
     """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly.
 
-    Planes closer together are tried only where dots are `lost`: a liquid makes a right board look less deep.
+    `stretches` are the depths of the planes over the stated ones that are tried.
     """
     tried = mistakes(orientation, board.planes_mm)
-    tried += [Mistake(stretch=stretch) for stretch in STRETCHES if lost or stretch > 1]
+    tried += [Mistake(stretch=stretch) for stretch in stretches]
     found = [contrast(signals, decoder, board, orientation, mistake) for mistake in tried]
     best = int(np.argmax(found))
     if not found[best]:
