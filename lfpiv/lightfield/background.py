@@ -26,6 +26,10 @@ NOISE_SIGMA = 3.0
 """Least count of a pixel that is counted among those brighter than chance, and least stray light [noise]."""
 LEAST_STANDING = 0.005
 """Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
+LIT_PART = 2.0
+"""Sensor over the part of it on which particles are imaged, as a rough figure."""
+RARE, OFTEN = 1e-4, 10.0
+"""Numbers of places with light in all images by chance: what may be neglected, and what shows how bright they are."""
 STANDS_EVERYWHERE = 0.6
 """Share of the lit parts of a sensor above which light that stands is that of particles at rest."""
 
@@ -62,9 +66,13 @@ class Series:
     decoder: LightFieldDecoder
     frame: int = 0
     """0 for the first frame, 1 for the second."""
+    overlapping: int | None = None
+    """Number of images that are shifted, see `overlapping_by_chance`; None: all."""
     count: int = 0
     noise: float = 0.0
     """Mean noise of the images so far [counts]."""
+    lit: float = 0.0
+    """Mean share of the pixels that particles light."""
     light: float = 0.0
     """Mean light of the images so far, summed over the sensor [counts]."""
     smallest: np.ndarray = field(init=False)
@@ -97,12 +105,27 @@ class Series:
             self.shifted, self.saturated = shifted, saturated.astype(np.uint16)
         else:
             np.minimum(self.smallest, light, out=self.smallest)
-            np.minimum(self.shifted, shifted, out=self.shifted)
+            if self.overlapping is None or self.count < self.overlapping:
+                np.minimum(self.shifted, shifted, out=self.shifted)
             np.maximum(self.largest, light, out=self.largest)
             self.saturated += saturated
         self.light += (float(light.sum(dtype=float)) - self.light) / (self.count + 1)
+        self.lit += (float(np.mean(light > CLEAR_SIGMA * noise)) - self.lit) / (self.count + 1)
         self.noise += (noise - self.noise) / (self.count + 1)
         self.count += 1
+
+
+def overlapping_by_chance(series: Series) -> int | None:
+    """Return of how many images particles overlap somewhere by chance; None if the shifted images show chance.
+
+    Of few thin images, a chance of some percent shows in no shifted image but may in the images themselves. Their
+    minimum then has to surpass that of fewer shifted images, which overlap somewhere.
+    """
+    lenses = series.largest.size / series.decoder.optics.microimage_pitch_px**2
+    lit = LIT_PART * series.lit
+    if not 0 < lit < 1 or not RARE < lenses * lit**series.count < 1:
+        return None
+    return max(int(np.log(lenses / OFTEN) / -np.log(lit)), 1)
 
 
 def recorded_light(images: Sequence[tuple[np.ndarray, float, np.ndarray]], decoder: LightFieldDecoder) -> StandingLight:

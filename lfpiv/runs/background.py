@@ -183,7 +183,8 @@ def _of_series(
     else:
         found = background.standing_light(first, second, everywhere=everywhere)
         if found.region.any():  # again, with the images at equal power of the laser
-            first, second, _ = _read_series(experiment, camera, dark, pairs, apart, estimate=found)
+            few = background.overlapping_by_chance(first)
+            first, second, _ = _read_series(experiment, camera, dark, pairs, apart, estimate=found, overlapping=few)
             found = background.standing_light(first, second, everywhere=everywhere)
     _log_series(experiment, camera.name, found, first.count)
     return found
@@ -226,13 +227,14 @@ def _read_series(
     *,
     keep: bool = False,
     estimate: StandingLight | None = None,
+    overlapping: int | None = None,
 ) -> tuple[Series, Series | None, tuple[list[np.ndarray], list[np.ndarray]]]:
     """Read the images of one camera; return the series of both frames, and with `keep` all light.
 
     All images of a time series are of one frame: one laser lights them. They are independent when they are `apart`
     instants apart. An `estimate` gives the power of the laser in each image, by which it is divided.
     """
-    series = Series(camera.decoder, 0), Series(camera.decoder, 1)
+    series = Series(camera.decoder, 0, overlapping), Series(camera.decoder, 1, overlapping)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
         frames = stamps.background_frames(experiment, pair)

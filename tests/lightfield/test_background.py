@@ -7,7 +7,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from support import ideal_rig
 
-from lfpiv.lightfield.background import Series, median_light, recorded_light, standing_light
+from lfpiv.lightfield.background import (
+    Series,
+    median_light,
+    overlapping_by_chance,
+    recorded_light,
+    standing_light,
+)
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.standing_light import LARGE_REMAINS, mode, remains_warnings
 from lfpiv.warn import Code
@@ -69,6 +75,33 @@ def series(decoder, standing, pairs, *, power=None, level=1.0, second=0.9, at_re
 def test_particles_alone_show_nothing_that_stands(decoder, pairs, level):
     found = standing_light(*series(decoder, np.zeros(decoder.gain.shape), pairs, level=level))
     assert not found.found and not found.light[0].any() and not found.pixels.any() and found.place == ""
+
+
+def thin(decoder, standing, overlapping=None):
+    """Series of four images of 9 particles, one of which is near the same place in all."""
+    found = Series(decoder, 0, overlapping)
+    for number in range(4):
+        light = np.zeros(decoder.gain.shape)
+        rng = np.random.default_rng([5, number])
+        near = 200 + rng.integers(-6, 7), 240 + rng.integers(-6, 7)
+        places = [near, *zip(*(rng.integers(40, n - 40, 8) for n in light.shape), strict=True)]
+        for row, column in places:  # each in nine microimages
+            light[row - 20 : row + 21 : 20, column - 20 : column + 21 : 20] += 2 * np.pi * 3.0**2 * BRIGHT
+        image = record(gaussian_filter(light, 3.0) + standing, [9, number])
+        found.add(image, NOISE, image >= SATURATION)
+    return found
+
+
+def test_few_particles_that_overlap_by_chance_do_not_stand(decoder):
+    """Against all four images, shifted, their light stands: no others overlap. Two images overlap elsewhere."""
+    nothing_stands = np.zeros(decoder.gain.shape)
+    first = thin(decoder, nothing_stands)
+    assert standing_light(first, None).region.any()
+    few = overlapping_by_chance(first)
+    assert few is not None and few < first.count
+    assert not standing_light(thin(decoder, nothing_stands, few), None).region.any()
+    assert standing_light(thin(decoder, streak(decoder), few), None).region[:, 150].mean() > 0.9
+    assert overlapping_by_chance(series(decoder, nothing_stands, 3)[0]) is None  # dense
 
 
 @pytest.mark.parametrize("pairs", [2, pytest.param(8, marks=pytest.mark.slow)])
