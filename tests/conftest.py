@@ -37,6 +37,9 @@ def pytest_addoption(parser):
         help="run the kernels' loops for a GPU on the CPU, one thread after the other",
     )
     parser.addoption(
+        "--all", action="store_true", help="run the slow tests as well, as the continuous integration does"
+    )
+    parser.addoption(
         "--taichi",
         choices=("vulkan",),
         help="run Taichi's kernels by a driver of Vulkan, for example the software driver lavapipe of Mesa",
@@ -54,6 +57,15 @@ def pytest_configure(config):
         os.environ["LFPIV_EMULATE_GPU"] = "1"
     if arch := config.getoption("--taichi"):
         os.environ["LFPIV_TAICHI"] = arch
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out slow tests, unless all are asked for, or some by `-m` or by their names."""
+    if config.getoption("--all") or config.option.markexpr or any("::" in name for name in config.args):
+        return
+    slow = [item for item in items if "slow" in item.keywords]
+    config.hook.pytest_deselected(items=slow)
+    items[:] = [item for item in items if "slow" not in item.keywords]
 
 
 def share_of_cores(worker, workers):

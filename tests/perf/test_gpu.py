@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import gpu
+import gpu_measure
 import gpu_stages
 import pytest
 
@@ -60,7 +61,7 @@ def test_stages_run_with_emulated_loops_and_write_what_they_find(tmp_path):
 
 
 def test_figures_are_written_as_they_are_found(tmp_path):
-    found = gpu_stages.Findings(tmp_path / "paper.json", "paper")
+    found = gpu_measure.Findings(tmp_path / "paper.json", "paper")
     found.add("vectors [s]", 0.09)
     found.require(False, "off by 2 voxel")
     written = json.loads((tmp_path / "paper.json").read_text())
@@ -69,7 +70,7 @@ def test_figures_are_written_as_they_are_found(tmp_path):
 
 
 def test_times_of_kernels_are_sorted_and_counters_read(tmp_path):
-    rows = gpu_stages.rows({"forward kernel _sum": [1.0, 3.0], "forward kernel _across": [5.0, 6.0]})
+    rows = gpu_measure.rows({"forward kernel _sum": [1.0, 3.0], "forward kernel _across": [5.0, 6.0]})
     assert list(rows) == ["forward kernel _across", "forward kernel _sum"]
     assert rows["forward kernel _sum"] == {"count": 2, "total_ms": 4.0, "median_ms": 2.0, "largest_ms": 3.0}
     said = 'noise\n"ID","Metric Name","Metric Unit","Metric Value"\n"0","Duration","ns","12"\n"0","","",""\n'
