@@ -45,7 +45,7 @@ def run_tests(job: Job, name: str, *arguments: str) -> None:
     """Run tests on the device in several processes, and note which of them failed."""
     processes = str(max((os.cpu_count() or 4) - 3, 1)) if device() == "cuda" else "2"
     where = ["--device", "cuda"] if device() == "cuda" else ["--emulate-gpu"]
-    options = ["-q", "-n", processes, "-rfE", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow"]
+    options = ["-q", "-n", processes, "-rfE", "--tb=short", "-p", "no:cacheprovider"]
     status, seconds, said = command(job, name, sys.executable, "-m", "pytest", *options, *where, *arguments)
     failed = re.findall(r"^(?:FAILED|ERROR) (\S+)(?: - (.*))?$", said, re.MULTILINE)
     last = next((line for line in reversed(said.splitlines()) if re.search(r"\d+ (passed|failed|error)", line)), "")
