@@ -78,7 +78,8 @@ def _is_alive(process: int) -> bool:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a scratch path in the folder of `path`; rename it to `path` at the end, remove it on any failure.
 
-    The scratch path is unique, so two processes may write the same file. `remove_leftovers` finds those of killed ones.
+    The scratch path is unique, so two processes may write the same file. `remove_leftovers` finds the files of killed
+    processes.
     """
     scratch = scratch_path(path)
     try:

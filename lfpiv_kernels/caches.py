@@ -120,7 +120,7 @@ def log_compilation(folder: Path) -> None:
 
 
 def verify_warp(folder: Path) -> None:
-    """Remove modules of this package from Warp's cache whose files have changed; record those of new ones."""
+    """Remove modules of this package from Warp's cache whose files have changed; record the files of new modules."""
     removed = 0
     for module in folder.glob(_MODULE):
         if _UNFINISHED.search(module.name):

@@ -2,11 +2,14 @@
 
 Rules for the packages: who imports whom, and kernels that say what they write. The house is shown
 in `docs/contribute.md`; `MAY_IMPORT` is its table of arrows. Rules for the tests: they use public names, and each of
-them checks something. ``ruff`` has the other rules of style.
+them checks something. A rule for words: a sentence points back at most once. ``ruff`` has the other rules of style.
 """
 
 import ast
+import io
+import re
 import sys
+import tokenize
 from functools import cache
 from pathlib import Path
 
@@ -74,6 +77,22 @@ SETTERS = {"setattr", "getattr", "delattr", "hasattr"}
 """Functions that take the name of an attribute as a text."""
 ATOMICS = ("atomic_add", "atomic_sub", "atomic_max", "atomic_min", "atomic_exch", "atomic_cas", "tile_store")
 """Calls that write to their first argument."""
+
+
+FOLLOWS = (
+    "of or and that which who whose is are was were has have had in on by with for to at from before after behind beyond"
+    " as if the a an without beside per than where when but it they so not can may does"
+)
+"""Words that never follow a number: `one` before them, or at the end of a clause, points back."""
+IDIOMS = re.compile(
+    r"one (?:after|behind|beside) (?:the )?(?:other|another)|one (?:by|to|or) one|`[^`\n]*`", re.IGNORECASE
+)
+POINTS_BACK = re.compile(
+    rf"\bthat of\b|\bthose of\b|\bones\b|(?<!-)\bone\b(?!-)(?=[^\w\s]|\Z|\s+(?:{FOLLOWS.replace(' ', '|')})\b)",
+    re.IGNORECASE,
+)
+"""Words that stand for a noun of before. A reader looks for the noun; at most one of them is in a sentence."""
+SENTENCE_ENDS = re.compile(r"(?<=[.!?])[\"')\]*]*\s+|\n\s*\n|\n\s*(?:[-*]|\d+\.) |\||\n\s*-{3,}\n|\n#+ ")
 
 
 @cache
@@ -295,6 +314,49 @@ def tests():
         for function in functions(tree_of(path)):
             if function.name.startswith("test_") and not checks(function, checking):
                 yield path, f"{function.name} checks nothing"
+
+
+def sentences():
+    """A sentence of a docstring, a comment, a message or a page points back at most once."""
+    python = (*KERNEL_FILES, *PACKAGE_FILES, *(ROOT / "perf").rglob("*.py"), *FILES)
+    pages = (
+        ROOT / "README.md",
+        ROOT / "CHANGELOG.md",
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "docs/notebook").glob("*.md"),
+    )
+    for texts, paths in ((python_texts, python), (page_texts, pages)):
+        for path in paths:
+            for text in dict.fromkeys(texts(path)):
+                for sentence in SENTENCE_ENDS.split(text):
+                    if len(found := POINTS_BACK.findall(IDIOMS.sub("", sentence))) > 1:
+                        yield path, f"points back {len(found)} times ({', '.join(found)}): {' '.join(sentence.split())}"
+
+
+def python_texts(path):
+    """Yield what people read in a file of Python: docstrings, messages, and comments as they stand together."""
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.value.value
+        elif isinstance(node, ast.JoinedStr):
+            yield "".join(part.value if isinstance(part, ast.Constant) else "X" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "\n" not in node.value:
+            yield node.value
+    block, last = [], 0
+    for token in tokenize.generate_tokens(io.StringIO(path.read_text("utf-8")).readline):
+        if token.type == tokenize.COMMENT:
+            alone = not token.line[: token.start[1]].strip()
+            if block and not (alone and token.start[0] == last + 1):
+                yield "\n".join(block)
+                block = []
+            block.append(token.string.lstrip("#! "))
+            last = token.start[0]
+    yield "\n".join(block)
+
+
+def page_texts(path):
+    """Yield the prose of a page, without code and equations."""
+    yield re.sub(r"^```.*?^```\s*$|\$\$.*?\$\$", "\n\n", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
 RULES = (imports, circles, taichi, kernel_arguments, tests)

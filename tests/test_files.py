@@ -26,7 +26,7 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
 
 @pytest.mark.parametrize(("write", "content"), [("write_bytes", b"new"), ("write_text", "new"), ("write_json", "new")])
 def test_a_written_file_appears_at_once_and_whole(tmp_path, monkeypatch, write, content):
-    """A process that ends before the new file takes the old one's place leaves the old one."""
+    """A process that ends before the new file takes its place leaves the old file."""
 
     def end(*_):
         raise OSError("the process ended")

@@ -163,7 +163,7 @@ VECTOR_FIGURES = (
         key="divergence",
         title="divergence",
         unit="%",
-        text="Root mean square of the divergence of the measured displacement less that of the true one, by central "
+        text="Root mean square of the difference of the divergences of measured and true displacement, by central "
         "differences on the result's lattice where all neighbours are kept. In a flow without divergence that of the "
         "measured displacement.",
         source=DIVERGENCE,

@@ -33,7 +33,7 @@ FITTED_PITCH = 0.1
 NEARER_DEG = 10.0
 """Angle by which the fitted pose must be nearer to a mirror image of the stated one than to itself [degree]."""
 OTHER_ARRAY = 0.5
-"""Light between the microimages of another camera's white image, relative to that of the own one, below which board
+"""Light between the microimages of another camera's white image, relative to the own white image, below which board
 images belong to the other camera."""
 
 Decoders = Callable[[CameraSetup], LightFieldDecoder]
@@ -95,7 +95,7 @@ def cause(experiment: Experiment, decoder_of: Decoders, stretches: Sequence[floa
 
 
 def likely_stretches(lens: ThinLensModel | None) -> list[float]:
-    """Return the depths of the planes over the stated ones that dots may show: those of other units, a half and twice.
+    """Return the ratios of true to stated depths that dots may show: other units, a half and twice.
 
     `lens` is the camera fitted to its dots, None if they were not found. Planes that are further apart than stated
     look as through a wider aperture.
@@ -139,8 +139,8 @@ def _planes(experiment: Experiment, found: Mapping[str, Mistake]) -> str:
         return ""
     if len(names) < len(experiment.cameras):
         return (
-            f"board.images: those of {_cameras(names)} are in the reverse order of board.planes_mm, and those of the "
-            "other cameras are not. Name the files in the order of the planes."
+            f"board.images: those of {_cameras(names)} are in the reverse order of board.planes_mm; the other cameras' "
+            "images are not. Name the files in the order of the planes."
         )
     depths = ", ".join(f"{z:g}" for z in found[names[0]].depths_mm(experiment.board.planes_mm))
     return (
@@ -202,7 +202,7 @@ def _facing(experiment: Experiment, names: list[str]) -> bool:
 
 
 def _same_place(experiment: Experiment, names: list[str], others: list[str]) -> bool:
-    """Return whether one of some cameras is stated to stand where one of the others does."""
+    """Return whether two cameras, of different groups, are stated to stand at the same place."""
     stated = [[experiment.camera(name).orientation for name in some] for some in (names, others)]
     return any(
         np.degrees(np.arccos(np.clip(one.rotation[2] @ other.rotation[2], -1, 1))) < ALIKE_DEG

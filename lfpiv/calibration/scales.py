@@ -43,7 +43,7 @@ class Scales:
     """Scales of a board as one or all cameras see them."""
 
     dots: float
-    """Magnification over the stated one: spacing of the dots over the stated one, if the optics are as stated."""
+    """Magnification over the stated one, by the spacing of the dots if the optics are as stated."""
     dots_std: float
     planes: float
     """Distance of the planes over the stated one, in units of the true over the stated spacing of the dots."""

@@ -1,7 +1,7 @@
-"""Segments of a time series: instants that are reconstructed one after the other, each from the one before.
+"""Segments of a time series: instants that are reconstructed in turn, each from its predecessor.
 
 Segments begin at fixed numbers of instants, whatever pairs a run is asked for. A few instants are reconstructed before
-the first one of a segment, only to lead into it, and a few after the last one, to correct the last ones. So the volume
+a segment, only to lead into it, and a few after it, to correct its last instants. So the volume
 of an instant depends on its own images and on those of a known range of instants beside it, and on nothing else.
 """
 
@@ -23,7 +23,7 @@ def segment_of(instant: int) -> int:
 
 
 def followed(series: Series, instant: int) -> range:
-    """Return the instants that are reconstructed one after the other up to one, that one included.
+    """Return the instants that are reconstructed in turn up to and with an instant.
 
     They begin with those that lead into its segment, as far as the series has them.
     """

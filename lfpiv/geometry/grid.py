@@ -148,7 +148,7 @@ class Grid:
         Parameters
         ----------
         factor : float
-            Edge of this grid's voxels over that of the smaller ones, >= 1.
+            Edge of this grid's voxels over the edge of the smaller voxels, >= 1.
 
         Raises
         ------

@@ -32,7 +32,7 @@ class Voxels:
     layers: Layers = NO_LAYERS
     """Layers of voxels beyond its faces."""
     refinement: float = 1.0
-    """Edge of its voxels over that of the reconstructed ones."""
+    """Edge of its voxels over the edge of reconstructed voxels."""
     particle_voxel: float = 0.0
     """Size of the particles, standard deviation [voxel of the volume]."""
 

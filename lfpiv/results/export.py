@@ -54,7 +54,7 @@ class Format(enum.Enum):
     ZARR = (
         "vectors.zarr, one Zarr store of all pairs or instants, to which a later export adds what is new: xarray, dask"
     )
-    CSV = "one table per pair or instant, a row per vector, one of its linked particles, one of tracks; with units"
+    CSV = "a table per pair or instant, a row per vector; of its linked particles; of all tracks; with units"
     VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection; one of tracks: ParaView"
     PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"
 

@@ -1,7 +1,7 @@
 """Identity of the images that a result was made from: whether they are still the same, without reading all of them.
 
 A stamp states path, size, times and a digest of the content of each image. An image counts as unchanged if its size and
-both times of its last change are the stated ones: that of its content, which programs may set back, and that of its
+both times of its last change are as stated: the time of its content, which programs may set back, and the time of its
 entry in the file system, which they may not. Where only times differ, as in a copy, the content is read and decides. So
 touching or copying images repeats no work, and changing a byte of them does.
 

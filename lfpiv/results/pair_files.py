@@ -161,8 +161,8 @@ class PairFiles:
         """Return the files of a pair.
 
         `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light. `guard`
-        has the guard layers of the volumes, `refinement` is the edge of their voxels over that of the reconstructed
-        ones.
+        has the guard layers of the volumes, `refinement` is the edge of their voxels over the edge of reconstructed
+        voxels.
         """
         stamps = of_pair(experiment, calibration, pair, background=background, guard=guard, refinement=refinement)
         frames = experiment.pair_frames(pair)

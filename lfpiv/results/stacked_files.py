@@ -206,8 +206,8 @@ def _listed(folder: Path, pairs: tuple[int, int | None] | None) -> tuple[str, ar
                 found[match[1]].append(int(match[2]))
     if all(found.values()):
         raise InputError(
-            f"{vectors}: expected vectors of image pairs or of a time series, found both. Move those of one of the "
-            "runs to another folder."
+            f"{vectors}: expected vectors of image pairs or of a time series, found both. Move the files of one run "
+            "to another folder."
         )
     dimension = INSTANT if found[INSTANT] else PAIR
     known = np.sort(np.array(found[dimension], np.int64))

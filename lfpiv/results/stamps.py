@@ -157,8 +157,9 @@ def of_pair(
 ) -> PairStamps:
     """Return the stamps of the volumes and of the vectors of a pair.
 
-    `calibration` is the hash of its stamp, `background` that of the light that is subtracted from the images, `guard`
-    the guard layers of the volumes, `refinement` the edge of their voxels over that of the reconstructed ones.
+    `calibration` is the hash of its stamp, `background` the hash of the light that is subtracted from the images,
+    `guard` the guard layers of the volumes, `refinement` the edge of their voxels over the edge of reconstructed
+    voxels.
     """
     light, start = _of_light(experiment, calibration, background), experiment.path.parent
     parts = light | {

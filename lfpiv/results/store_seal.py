@@ -1,7 +1,7 @@
 """Trust in stores: their form is checked before zarr opens them; a complete store is sealed, and verified.
 
-A NetCDF store has the seal of `lfpiv.hdf5`. A Zarr store has two digests in its consolidated metadata: one of all bytes
-of all files, and one of everything but the values of the variables. The first is checked for stores of up to
+A NetCDF store has the seal of `lfpiv.hdf5`. A Zarr store has two digests in its consolidated metadata: of all bytes of
+all files, and of everything but the values of the variables. The first is checked for stores of up to
 `WHOLE_BYTES`, the second for larger ones, whose chunks have checksums of their own.
 
 Digests have no key: whoever can write the folder can make them. Codecs of numcodecs can run code that a chunk holds. So

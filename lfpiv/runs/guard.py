@@ -78,7 +78,7 @@ def read(folder: Folder) -> tuple[Guard, Marks] | None:
 
 
 def layers(experiment: Experiment, guard: Guard | None) -> Layers:
-    """Return the guard layers of an experiment: those of its file, or at least `LEAST_LAYERS` and the measured ones."""
+    """Return the guard layers of an experiment: stated in its file, or measured, at least `LEAST_LAYERS`."""
     if experiment.guard_mm != "auto":
         return experiment.grid.layers(experiment.guard_mm)
     measured = NO_LAYERS if guard is None else guard.layers

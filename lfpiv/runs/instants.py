@@ -66,7 +66,7 @@ class InstantWork(Protocol):
         """Reconstruct one instant."""
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct one instant from the one before; return it and what the next one needs."""
+        """Reconstruct an instant from its predecessor; return it and what its successor needs."""
 
     def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
         """Reconstruct one of successive instants again from those before and after it."""
@@ -113,7 +113,7 @@ class Instants:
     """Instants whose volumes are stored for other processes."""
     held: dict[Frame, Instant | Failure] = field(default_factory=dict)
     taken: list[Path] = field(default_factory=list)
-    """Files of other processes that this one has read and no other one needs."""
+    """Files of other processes that are read here and needed by no other process."""
 
     def volumes(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
         """Return the volumes of a pair and the warnings about both its instants.

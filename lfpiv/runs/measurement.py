@@ -46,7 +46,7 @@ class Rig(Shown):
     guard: Layers
     """Layers of voxels, in those of the experiment, beyond each face of its grid (z, y, x)."""
     refinement: float
-    """Edge of a voxel of the experiment over that of the reconstructed ones."""
+    """Edge of a voxel of the experiment over the edge of a reconstructed voxel."""
     work: PairWork
     """The work on pairs, as a run does it."""
 
@@ -68,8 +68,8 @@ class Rig(Shown):
     def light(self, pair: int) -> tuple[FrameLight, FrameLight]:
         """Read the images of both frames of a pair.
 
-        The ``images`` of a frame are those of each camera, less dark image and background, shape (rows, columns)
-        [counts]; ``noise`` is that of their background [counts], the floor of `lfpiv.reconstruct`.
+        The ``images`` of a frame are given by camera, less dark image and background, shape (rows, columns) [counts];
+        ``noise`` is the noise of their background [counts], the floor of `lfpiv.reconstruct`.
 
         Raises
         ------
@@ -242,8 +242,8 @@ def _require_cameras(calibration: Calibration, experiment: Experiment) -> None:
     stated = {camera.name: camera.optics for camera in experiment.cameras}
     if {name: camera.optics for name, camera in calibration.cameras.items()} != stated:
         raise InputError(
-            f"calibration: expected one of the cameras {', '.join(stated)} with the optics of {experiment.path}, found "
-            f"one of {', '.join(calibration.cameras)}. Calibrate again."
+            f"calibration: expected the cameras {', '.join(stated)} with the optics of {experiment.path}, found "
+            f"{', '.join(calibration.cameras)}. Calibrate again."
         )
 
 

@@ -75,8 +75,8 @@ def _volumes_bytes(experiment: Experiment) -> int:
 def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
     """Estimate the memory of the instants that a process holds beyond a pair, to reconstruct others from them [byte].
 
-    These are the instants between those of a pair, with their images, those that correct one and that one, with splines
-    of their volumes and the later of them with their images twice, and the three volumes of a prediction.
+    These are the instants between the two of a pair, with their images; an instant and all that correct it, with
+    splines of their volumes, the later of them with their images twice; and the three volumes of a prediction.
     """
     if not experiment.in_sequence or experiment.series is None:
         return 0

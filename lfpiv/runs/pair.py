@@ -285,7 +285,7 @@ class PairWork:
         return self.reconstructor.instant(light, progress)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct one instant of a series from the one before; return it and what the next one needs.
+        """Reconstruct an instant of a series from its predecessor; return it and what its successor needs.
 
         Raises
         ------
@@ -405,7 +405,7 @@ class PairWork:
 
 
 def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:
-    """Yield each pair with the one that comes after it, None for the last one."""
+    """Yield each pair with its successor, None for the last pair."""
     source = iter(pairs)
     present = next(source, None)
     while present is not None:

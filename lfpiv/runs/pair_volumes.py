@@ -143,7 +143,7 @@ class Reconstructor:
         return self._frame(found.to_dataarray(), light, seconds)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct one instant of a series from the one before, and return it with what the next one needs.
+        """Reconstruct an instant of a series from its predecessor, and return it with what its successor needs.
 
         Raises
         ------

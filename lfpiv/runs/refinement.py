@@ -42,7 +42,7 @@ class Refinement:
     size_voxel: float | None
     """Standard deviation of the particles [voxel of the experiment]; 0 for points, None if it could not be measured."""
     factor: float
-    """Edge of a voxel over that of the reconstructed ones, >= 1."""
+    """Edge of a voxel over the edge of a reconstructed voxel, >= 1."""
     demanded: float
     """The same without regard to the memory."""
 
@@ -72,7 +72,7 @@ def read(folder: Folder) -> tuple[Refinement, Marks] | None:
 
 
 def factor(experiment: Experiment, found: Refinement | None) -> float:
-    """Return the refinement of an experiment: that of its file, or the measured one; 1 before `decide`."""
+    """Return the refinement of an experiment: stated in its file, or measured; 1 before `decide`."""
     stated = experiment.smart.refinement
     if stated != "auto":
         return float(stated)

@@ -154,7 +154,7 @@ class Run:
 
     @property
     def refinement_factor(self) -> float:
-        """Edge of a voxel over that of the reconstructed ones; 1 if it is yet to be measured."""
+        """Edge of a voxel over the edge of a reconstructed voxel; 1 if it is yet to be measured."""
         return refinement.factor(self.experiment, self.refinement)
 
     @property

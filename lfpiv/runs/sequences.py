@@ -87,7 +87,7 @@ class SegmentInstants:
         self.ahead = {number: found for number, found in self.ahead.items() if number >= first}
 
     def reach(self, frame: Frame, progress: StepProgress) -> Instant:
-        """Reconstruct instants up to one and return that one; raise Failure if it failed."""
+        """Reconstruct instants up to `instant` and return it; raise Failure if it failed."""
         if frame.number not in self.ahead:
             assert self.work.experiment.series is not None
             series = self.work.experiment.series
@@ -155,7 +155,7 @@ class SegmentInstants:
             return failure(error)
 
     def _beside(self, number: int) -> tuple[list[Followed], int]:
-        """Return the instants by which one is corrected, with that one, and its index among them."""
+        """Return an instant with those that correct it, and its index among them."""
 
         def known(one: int) -> bool:
             return isinstance(self.trail.get(one), Followed)

@@ -120,7 +120,7 @@ def other_mistakes(cameras: Sequence[str], shifts: Iterable[int], images: Iterab
 
 
 def _one_of_two(cameras: Sequence[str]) -> Sequence[str]:
-    """Leave out the second of two cameras: mistakes in the order of its images are those of the first one."""
+    """Leave out the second of two cameras: mistakes in the order of its images are the first camera's."""
     return cameras[:1] if len(cameras) == 2 else cameras
 
 
@@ -235,7 +235,7 @@ class Judgement:
 
     @property
     def fits(self) -> bool:
-        """Whether the images fit clearly better than by chance, and than those of other cameras and mirrored ones.
+        """Whether the images fit clearly better than by chance, than images of other cameras, and than mirrored images.
 
         Each frame beats chance, too. The order of frames does not count, since particles that hardly move fit in either
         order.

@@ -188,7 +188,7 @@ def disparities(
 ) -> tuple[Disparity, ...]:
     """Measure the disparities of all pairs of cameras by particle images of some instants.
 
-    Parameters are those of `CameraVolumes` and `CameraVolumes.add`; the result is that of `CameraVolumes.disparities`.
+    Parameters as of `CameraVolumes` and `CameraVolumes.add`; result as of `CameraVolumes.disparities`.
     """
     volumes = CameraVolumes(weights)
     for number, instant in enumerate(images):

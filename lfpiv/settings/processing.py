@@ -41,8 +41,8 @@ class Smart(Table):
     floor_share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.1
     """Lower limit of the noise floor, as a share of the images' brightness; 0 takes the measured noise."""
     intensity_cap: Annotated[float, Field(strict=True, ge=0, le=100)] | Literal["auto"] = "auto"
-    """Upper limit of the images' counts, as a multiple of the median over the lit microimages of each one's brightest
-    pixel; 0 switches it off, "auto" does so where the images show equally bright particles, and takes 1 for other
+    """Upper limit of the images' counts, as a multiple of the median over the lit microimages of the brightest pixel; 0
+    switches it off, "auto" does so where the images show equally bright particles, and takes 1 for other
     particles smaller than voxels and 2 for larger ones."""
     sieve_voxel: Annotated[float, Field(strict=True, ge=0, le=5)] | Literal["auto"] = "auto"
     """Standard deviation of the Gaussians that make up the volume [voxel]; 0 lets voxels vary freely, "auto" takes the
@@ -62,7 +62,7 @@ class Smart(Table):
     def of_one_frame(self, refinement: float = 1.0) -> dict[str, Any]:
         """Return the settings of `lfpiv.reconstruct`, which reconstructs one frame.
 
-        `refinement` is the edge of a voxel over that of the reconstructed ones, in which the sieve is returned.
+        `refinement` is the edge of a voxel over the edge of a reconstructed voxel, in which the sieve is returned.
         """
         settings = self.model_dump(exclude={"motion_passes", "predict", "refinement"})
         sieve = settings["sieve_voxel"]
@@ -163,7 +163,7 @@ class Bootstrap(Table):
     """Table ``[bootstrap]``: damping of the flow's fluctuations by ghosts, measured in simulated pairs."""
 
     pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] | Literal["auto"] = "auto"
-    """Number of pairs that are simulated after a pilot, each at the cost of a recorded one; "auto" takes one for ten
+    """Number of pairs that are simulated after a pilot, each at the cost of a recorded pair; "auto" takes one for ten
     recorded pairs, the pilot included, at most 12 and none in runs of fewer than 20 pairs, 0 measures nothing."""
 
     def count(self, pairs: int) -> int:

@@ -232,7 +232,7 @@ def _camera_images(
 
 
 def _background_names(scene: Scene) -> list[str]:
-    """Return the paths of the images without particles: one for each frame of pairs, a single one for a series."""
+    """Return the paths of the images without particles: for pairs as many as frames, for a series a single path."""
     if scene.particles.instants is not None:
         return ["background/{camera}.tif"]
     return [f"background/{{camera}}_{frame}.tif" for frame in FRAMES]

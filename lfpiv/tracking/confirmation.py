@@ -176,7 +176,7 @@ def shown(normal: Normal, found: Signals, error: float, least: float, part: floa
 def fitting(lacking: np.ndarray, error: float, found: Signals) -> np.ndarray:
     """Return the particles whose light is in the image of every camera that sees them, shape (particle,), bool.
 
-    One that joins the light of two particles, of one in each camera, is brighter than the images beside their peaks.
+    A particle that joins the light of two others, one in each camera, is brighter than the images beside their peaks.
     Light that is not explained yet counts for no particle and against none. `lacking` is from `misfits`, `error` from
     `model_error`.
     """

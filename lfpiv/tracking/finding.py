@@ -46,7 +46,7 @@ EARLY = 0.5
 CANDIDATE = 0.3
 """Least light of a candidate, relative to that of a particle that is just significant: a volume spreads light."""
 LEAST_GAIN = confirmation.SIGNIFICANCE**2
-"""Least fall of the weighted squares of the residuals in a round without more particles for another one to follow:
+"""Least fall of the weighted squares of the residuals in a round without more particles for another round to follow:
 that of a significant particle."""
 SIZED_ROUNDS = 2
 """Rounds after which the particles' size is fitted."""

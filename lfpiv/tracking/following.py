@@ -23,7 +23,7 @@ from lfpiv.tracking.linking import FIRST_SPREAD_VOXEL, NEIGHBOURS, matched, near
 from lfpiv.tracking.trajectory import TELLING_TRACKS, Measured, Motion, State, fit_motion
 
 LONGEST_GAP = 2
-"""Largest number of instants from one in which the particle of a track is found to the next one."""
+"""Largest distance between two successive instants in which the particle of a track is found."""
 NEAR_VOXEL = 1.0
 """Distance within which two candidates are one [voxel]."""
 FIRST_FIT = 4
@@ -66,7 +66,7 @@ class Candidates:
         return found._without_copies()
 
     def _without_copies(self) -> Candidates:
-        """Return the particles without those that an earlier one, or one with a valid link, stands for."""
+        """Return the particles without duplicates of an earlier particle, or of a particle with a valid link."""
         order = np.argsort(~self.valid, kind="stable")
         pairs = cKDTree(self.positions_voxel[order]).query_pairs(NEAR_VOXEL) if len(order) else set()
         kept = np.ones(len(order), bool)

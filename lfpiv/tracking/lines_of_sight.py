@@ -35,7 +35,7 @@ REFINED = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Line:
-    """Places on a line of sight; the first one is that of the particle. Arrays have a row for each place."""
+    """Places on a line of sight, the particle's own place first. Arrays have a row for each place."""
 
     positions_mm: np.ndarray
     """Places (x, y, z) [mm], shape (place, 3)."""

@@ -34,7 +34,7 @@ REACH = 4.0
 LIGHT_SPREAD = 0.35
 """Standard deviation of the logarithm of a particle's light between two frames."""
 AMBIGUOUS = 6.0
-"""Least difference of cost between a link and the next best one; smaller ones are dropped."""
+"""Least difference of cost between a link and the next best link; nearer rivals drop both."""
 NEIGHBOURS = 10
 """Links about a link that judge it."""
 RESIDUAL_LIMIT = 4.0

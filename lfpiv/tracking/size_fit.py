@@ -20,9 +20,9 @@ CLEAR_OVERLAP = 0.3
 LEAST_CLEAR, MOST_CLEAR = 8, 100
 """Least and largest number of particles that tell the size."""
 WEAK = 0.5
-"""Light of a particle, relative to one that it overlaps, below which it may be what a wrong size leaves of that one."""
+"""A particle dimmer than this share of an overlapping particle may be a residual of a wrong size."""
 MOSTLY = 0.5
-"""Least share of the particles that are clear once weak ones are left out. In dense seeding weak ones are true ones."""
+"""Least share of the particles that are clear once weak ones are left out. In dense seeding weak particles are true."""
 LARGEST_RATIO = 1.15
 """Largest size of the particles over that which the autocovariance of the images shows, before particles are found.
 Particles that are not told apart look larger."""

@@ -26,7 +26,7 @@ DIRECTIONS = np.array(
         if tuple(at) > (0, 0, 0)
     ]
 )
-"""Directions of a cube's neighbours, one of each two opposite ones, shape (direction, 3)."""
+"""Directions of a cube's neighbours, of two opposite directions the first, shape (direction, 3)."""
 LEAST_GAIN = 25.0
 """Least squared residual that a pair must explain beyond one particle [noise^2]."""
 GAIN_SHARE = 0.5

@@ -1,6 +1,6 @@
 """Tables of tracks as datasets: particles of a time series with velocity and acceleration, fitted along each track.
 
-A false particle is the crossing of lines of sight of true ones, which hardly stays one for long. So tracks that are
+A false particle is a crossing of lines of sight of true particles, which hardly lasts. So tracks that are
 short are left out, and so are those that move unlike their neighbours.
 """
 

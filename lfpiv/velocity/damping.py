@@ -44,7 +44,8 @@ SLOPES = (0.5, 1.2)
 LARGEST_ERROR = 0.1
 """Largest standard error of a slope that is corrected, as a share of the slope."""
 LARGEST_LOSS = 1.1
-"""Largest expected error of corrected vectors over that of raw ones. Division by the slope amplifies random errors."""
+"""Largest expected error of corrected vectors over the error of raw vectors. Division by the slope amplifies random
+errors."""
 
 UNBIASED = {"x": "u_unbiased", "y": "v_unbiased", "z": "w_unbiased"}
 """Axis -> variable of its velocity without damping."""
@@ -114,7 +115,7 @@ class AxisDamping:
 
     @property
     def noise_gain(self) -> float:
-        """Random errors of vectors without damping over those of raw ones."""
+        """Random errors of vectors without damping over random errors of raw vectors."""
         if self.scatter_unbiased is None or not self.scatter > 0:
             return 1 / self.slope
         return self.scatter_unbiased / self.scatter

@@ -2,7 +2,7 @@
 
 Simulated pairs are never quite as hard to measure as recorded ones: a field from vectors lacks what windows do not
 show. The same ghosts make the random errors that correlation statistics state and the damping. So the damping of
-recorded pairs, 1 - S, is that of simulated ones times the ratio of their random deviations, as a ratio estimator [1]_
+recorded pairs, 1 - S, is the simulated damping times the ratio of their random deviations, as a ratio estimator [1]_
 takes it from what is known of both. The standard error holds the whole change once more.
 
 References
@@ -95,7 +95,7 @@ def _of_axis(pairs: Sequence[Simulated], axis: str, likeness: Likeness | None) -
 
 
 def _of_recorded(found: AxisDamping, likeness: Likeness) -> AxisDamping:
-    """Return the damping of recorded pairs, given that of simulated ones and the ratio of their random errors."""
+    """Return the damping of recorded pairs, given the simulated damping and the ratio of their random errors."""
     ratio, taken = likeness.errors_ratio, 1 - found.slope
     slope = 1 - ratio * taken
     if not slope > 0:

@@ -1,8 +1,8 @@
 """`Likeness`: whether simulated pairs are as hard to measure as recorded ones, from what vectors show without truth.
 
 Ghosts and noise lower the correlation. So they show in the share of vectors that are valid and in the random standard
-deviation that correlation statistics state. Damping that was measured in pairs with more ghosts than the recorded ones
-have is too strong, and vectors corrected by it are worse than raw ones.
+deviation that correlation statistics state. Damping that was measured in pairs with more ghosts than the recorded pairs
+have is too strong, and vectors corrected by it are worse than raw vectors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ WHOLE_FLUID = 0.99
 FEWER_VALID = 0.05
 """Share of vectors that may be valid in recorded pairs only."""
 LARGER_DEVIATION = 1.2
-"""Random standard deviation of simulated pairs over that of recorded ones that is still alike. Damping of 0.15 is then
+"""Largest ratio of the random standard deviations of simulated and recorded pairs that are still alike. Damping of 0.15
+is then
 wrong by some 0.03."""
 SIGNIFICANT = 2.0
 """Least difference of simulated from recorded pairs [standard error]."""
@@ -63,7 +64,7 @@ class Likeness:
 
     @property
     def errors_ratio(self) -> float:
-        """Random standard deviation of recorded pairs over that of simulated ones; 1 if none is stated."""
+        """Ratio of the random standard deviations of recorded and simulated pairs; 1 if none is stated."""
         random = self.deviation_voxel
         if random is None or not min(random.recorded, random.simulated) > 0:
             return 1.0

@@ -232,7 +232,7 @@ class _Group:
 
 
 def _extend(known: array[int], numbers: Iterable[int]) -> None:
-    """Add numbers, but not one that equals the last one."""
+    """Add numbers, but none that equals the last."""
     for number in numbers:
         if not known or number != known[-1]:
             known.append(number)

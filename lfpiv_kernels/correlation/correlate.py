@@ -61,7 +61,8 @@ def correlate_windows(
     The coefficient at lag L is ``sum((a - mean a) (b_L - mean b_L)) / sqrt(sum (a - mean a)^2 sum (b_L - mean b_L)^2)``
     with a the window of `first` and b_L the window of `second` moved by L. Outside the volume `second` counts as 0, so
     the background of both volumes should be 0. Particles cut by the edge of a but whole in b_L disturb the peak. The
-    symmetric coefficient is the mean of this one and that of the window of `second` with `first` moved by -L. It does
+    symmetric coefficient is the mean of this one and of its counterpart, the window of `second` with `first` moved by
+    -L. It does
     not have this error around L = 0, and swapping the volumes negates its displacements.
 
     Parameters

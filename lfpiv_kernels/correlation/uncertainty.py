@@ -94,8 +94,8 @@ def _window_sums(
 ) -> tuple[list[np.ndarray], Iterator[list[np.ndarray]]]:
     """Return sums over windows, shape `count`, float64.
 
-    They are those of both volumes, of their product and of their squares, and for each axis those of the products at a
-    lag of 1 and of -1, of their difference, of the squares of the difference's sums over cubes, and of the products of
+    They are the sums of both volumes, of their product and of their squares, and for each axis of the products at a lag
+    of 1 and of -1, of their difference, of the squares of the difference's sums over cubes, and of the products of
     each volume with itself at a lag of 1.
     """
     keep = tuple(slice(o, o + (c - 1) * s + 1, s) for o, c, s in zip(origin, count, step, strict=True))

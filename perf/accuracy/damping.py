@@ -194,7 +194,7 @@ def slopes(fields: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[n
 
 
 def figures_of(damping: Damping, pairs: Sequence[Pair]) -> dict[str, list[float]]:
-    """Compare the damping of simulated pairs with recorded ones, and vectors without it with raw ones.
+    """Compare the damping of simulated and recorded pairs, and vectors without it with raw vectors.
 
     Returns
     -------

@@ -89,8 +89,9 @@ def figures_of(case: Case, rig: Rig, recorded: Recorded, measured: Measured) -> 
     Returns
     -------
     dict
-        `particles` in the volume; `found`, share of them with a found one within a voxel, and `found_bright`, of the
-        bright ones; `false`, share of the found ones in the volume without a true one; `position_x`, `_y`, `_z`,
+        `particles` in the volume; `found`, share of them with a found particle within a voxel, and `found_bright`, of
+        the bright particles; `false`, share of found particles in the volume without a true particle; `position_x`,
+        `_y`, `_z`,
         `position`, root mean square errors, `median_z` [voxel]; `linked`, valid links per particle; `wrong`, share of
         valid links off by more than a voxel; `moved_x`, `_y`, `_z`, mean errors of the displacement [voxel]; `within`,
         share of their components within two standard errors; `crowding`; `yield`, links per found particle; `cpu_s` of

@@ -2,8 +2,8 @@
 
     python perf/accuracy/tracking_causes.py --conditions poly --weakest 0.01 --seeds 1,2,3
 
-A false particle is a `piece` where it overlaps one true particle in all cameras and that one is found as well,
-`displaced` where that one is not found, a `ghost` where it overlaps another true particle in each camera, `partial`
+A false particle is a `piece` where it overlaps a true particle in all cameras that is found as well, `displaced` where
+this particle is not found, a `ghost` where it overlaps another true particle in each camera, `partial`
 where it overlaps true particles in some cameras only, and `dark` where it overlaps none. A missed particle is `dim`
 below a signal to noise of `CLEAR`, `hidden` where a brighter one covers half of its image in some camera, `displaced`
 where a false one stands for it, and `clear` otherwise.

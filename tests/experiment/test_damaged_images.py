@@ -157,7 +157,7 @@ def test_absurd_sizes_are_refused_before_memory_is_taken(tmp_path, suffix):
 
 
 def test_a_bad_frame_is_one_bad_pair(tiny_experiment):
-    """A page that does not decode, one that is cut off and one beyond the end spoil the pairs that need them."""
+    """A page that does not decode, is cut off or lies beyond the end spoils the pairs that need it."""
     folder, rng = tiny_experiment.parent, np.random.default_rng(6)
     for name, shape in (("left", (48, 64)), ("right", (56, 40))):
         with tifffile.TiffWriter(folder / f"{name}.tif") as tiff:

@@ -81,7 +81,7 @@ def test_an_error_of_a_part_reaches_the_caller_after_all_parts_have_ended(device
 
     def job(part, first, last):
         if part < 2:
-            both.wait(TIMEOUT_S)  # one on the calling thread, one on another
+            both.wait(TIMEOUT_S)  # on the calling thread, and on another
         if threading.current_thread() is not threading.main_thread():
             time.sleep(0.05)
             ended.append(part)

@@ -79,7 +79,7 @@ def test_light_that_no_voxel_lights_changes_nothing_and_is_stated(weights):
 
 @pytest.mark.parametrize("per_voxel", [0.01, 0.0])
 def test_a_hot_pixel_raises_no_floor_and_no_particle_is_cut(weights, per_voxel):
-    """Many particles or a single one: the brightness is that of their light."""
+    """Many particles or a single one: the brightness follows their light."""
     truth = particles(weights.grid, 1, per_voxel)
     images, clean = recorded(weights, truth, 1), weights(truth)
     hot = {name: image.copy() for name, image in images.items()}

@@ -29,7 +29,7 @@ CASES = {
 VOLUMES = {1: 10, 4: 10.5}
 """Volumes that a reconstruction may allocate at once, by the number of subsets; the constants of the rig are older.
 
-Subsets: one of them is the coefficients before an epoch, to which it can be undone, and one the sum of its exponents.
+Subsets: the coefficients before an epoch, to which it can be undone, and the sum of its exponents.
 """
 
 

@@ -155,7 +155,7 @@ def test_memory_is_bytes_per_pair(tmp_path):
 
 
 def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path, monkeypatch):
-    """A hundred thousand pairs, said to have images: only those of the first ones are opened."""
+    """A hundred thousand pairs, said to have images: only those of the first pairs are opened."""
     text = tiny_experiment.read_text()
     assert "pairs = 2" in text
     tiny_experiment.write_text(text.replace("pairs = 2", f"pairs = {MANY}"))

@@ -73,7 +73,8 @@ def clean():
 
 
 def nearest(positions, true):
-    """Distance of each position from the nearest true one; those of one particle differ by far more than errors."""
+    """Distance of each position from the nearest true position; two positions of a particle differ by far more than
+    errors."""
     return cKDTree(true).query(positions)[0]
 
 

@@ -1,4 +1,4 @@
-"""A particle that is found in one of two frames only is looked for in the other one; candidates are confirmed."""
+"""A particle that is found in a single frame is looked for in the other one; candidates are confirmed."""
 
 from dataclasses import replace
 

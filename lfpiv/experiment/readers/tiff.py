@@ -84,7 +84,7 @@ class TiffStack(Stack):
         return np.frombuffer(read_bytes(self._file, start, length), dtype).reshape(header.shape)
 
     def _page(self, number: int) -> tifffile.TiffPage:
-        """Return the directory of a page, or that of the first one for images without a directory."""
+        """Return the directory of a page; images without a directory have the first page's."""
         number = number if number < len(self._offsets) else 0
         self._tiff.filehandle.seek(self._offsets[number])
         return tifffile.TiffPage(self._tiff, number)
