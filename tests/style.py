@@ -80,8 +80,8 @@ ATOMICS = ("atomic_add", "atomic_sub", "atomic_max", "atomic_min", "atomic_exch"
 
 
 FOLLOWS = (
-    "of or and that which who whose is are was were has have had in on by with for to at from before after behind beyond"
-    " as if the a an without beside per than where when but it they so not can may does"
+    "of or and that which who whose is are was were has have had in on by with for to at from before after behind"
+    " beyond as if the a an without beside per than where when but it they so not can may does"
 )
 """Words that never follow a number: `one` before them, or at the end of a clause, points back."""
 IDIOMS = re.compile(
