@@ -63,9 +63,14 @@ def pytest_collection_modifyitems(config, items):
     """Leave out slow tests, unless all are asked for, or some by `-m` or by their names."""
     if config.getoption("--all") or config.option.markexpr or any("::" in name for name in config.args):
         return
-    slow = [item for item in items if "slow" in item.keywords]
+    slow = [item for item in items if is_slow(item)]
     config.hook.pytest_deselected(items=slow)
-    items[:] = [item for item in items if "slow" not in item.keywords]
+    items[:] = [item for item in items if item not in slow]
+
+
+def is_slow(item):
+    """Whether a test has the marker `slow`; its parameters named in `but` are quick."""
+    return any(marker.kwargs.get("but", "::") not in item.name for marker in item.iter_markers("slow"))
 
 
 def share_of_cores(worker, workers):

@@ -144,8 +144,8 @@ def _judgement(profile: np.ndarray, sheet: LightSheet | None) -> str:
         quarter = len(profile) // 4
         middle = max(float(profile[quarter : len(profile) - quarter].mean()), 1e-30)
         return (
-            "No end of the light sheet shows inside the volume, so particles and ghosts cannot be told apart; a volume "
-            f"deeper than the sheet would do that. The first plane is {percent(profile[0] / middle)} and the last "
+            "The light sheet fills the volume, so the ghost level cannot be estimated. Reconstruct a deeper volume to "
+            f"see it. The first plane is {percent(profile[0] / middle)} and the last "
             f"{percent(profile[-1] / middle)} as bright as the middle half; well above 100 %, they take up light from "
             "outside the volume."
         )
