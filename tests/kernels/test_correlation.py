@@ -80,6 +80,7 @@ def peaks_twin(score, search, reach=2):
     return (refine(first) if inside else nothing), (refine(second) if second else nothing), score[first], rival
 
 
+@pytest.mark.slow(but="window1")
 @pytest.mark.parametrize("symmetric", [False, True], ids=["one-sided", "symmetric"])
 @pytest.mark.parametrize(
     ("window", "step", "search"),

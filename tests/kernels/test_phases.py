@@ -35,6 +35,7 @@ def is_inside(voxel, shape):
     return all(0 <= at < n for at, n in zip(voxel, shape, strict=True))
 
 
+@pytest.mark.slow(but="shape1")
 @pytest.mark.parametrize(("shape", "window", "step", "search"), CASES)
 def test_voxels_and_statistics_lie_where_the_layout_says(device, shape, window, step, search):
     volume = np.random.default_rng(0).random(shape, np.float32)

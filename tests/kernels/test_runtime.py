@@ -28,6 +28,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no fork there")
 def test_kernels_start_without_standard_error_and_a_forked_process_says_that_it_has_none():
     """Its threads stayed in the process it was forked from, so kernels there would never end."""
@@ -57,6 +58,7 @@ def test_kernels_start_without_a_home_directory(tmp_path):
     assert (done.returncode, done.stdout) == (0, "runs\n"), done.stderr
 
 
+@pytest.mark.slow
 def test_kernels_start_where_the_home_directory_cannot_be_written(tmp_path):
     """One line says where compiled kernels are; a second process uses them, and trusts no folder of others."""
     for private in (True, False):
@@ -68,6 +70,7 @@ def test_kernels_start_where_the_home_directory_cannot_be_written(tmp_path):
         folder.chmod(0o777)
 
 
+@pytest.mark.slow
 def test_too_little_address_space_is_named():
     done = started({}, limit=1 << 30)
     assert done.returncode == 1 and "ulimit -v" in done.stderr.splitlines()[-1], done.stderr

@@ -50,11 +50,13 @@ def rows_of(weights, ray_set):
     return np.broadcast_to(row == ray_set, (weights.ray_rows, weights.rays_of_row)).ravel()
 
 
+@pytest.mark.slow
 def test_rigs_are_what_they_say():
     moved = {name: made(name)[0].axes[2] != 2 for name in RIGS}
     assert moved == {"upright": False, "turned camera and array": False, "columns apart in memory": True}
 
 
+@pytest.mark.slow(but="upright")
 def test_light_on_rays_is_that_of_the_twin(case):
     _, weights, projector, matrix = case
     volume = np.random.default_rng(1).random(matrix.shape[1]).astype(np.float32)
@@ -71,6 +73,7 @@ def test_light_on_rays_is_that_of_the_twin(case):
             assert not projector.rays.numpy()[~some].any()
 
 
+@pytest.mark.slow(but="upright")
 def test_voxels_gather_the_adjoint(case):
     _, weights, projector, matrix = case
     rays = np.random.default_rng(2).standard_normal(len(matrix)).astype(np.float32)
@@ -88,6 +91,7 @@ def test_voxels_gather_the_adjoint(case):
         np.testing.assert_allclose(masked, before + active * expected, atol=atol)
 
 
+@pytest.mark.slow(but="upright")
 def test_projection_and_back_projection_are_adjoint(case):
     _, weights, projector, matrix = case
     rng, pixels = np.random.default_rng(5), int(np.prod(weights.sensor_shape))
@@ -102,6 +106,7 @@ def test_projection_and_back_projection_are_adjoint(case):
     np.testing.assert_allclose(found, expected, atol=2 * ROUNDING * expected.max())
 
 
+@pytest.mark.slow(but="upright")
 @pytest.mark.parametrize("rays_at_once", [1, 5000, 30_000])
 def test_light_does_not_depend_on_how_the_work_is_cut(case, rays_at_once, monkeypatch):
     _, weights, projector, matrix = case
@@ -123,6 +128,7 @@ def test_light_does_not_depend_on_how_the_work_is_cut(case, rays_at_once, monkey
             np.testing.assert_array_equal(found, one)
 
 
+@pytest.mark.slow(but="upright")
 @pytest.mark.parametrize("at_once", ["all ray rows", "one ray row"])
 def test_loops_for_a_gpu_give_the_light_of_those_for_the_cpu(case, at_once, monkeypatch):
     _, weights, projector, matrix = case
@@ -144,6 +150,7 @@ def test_loops_for_a_gpu_give_the_light_of_those_for_the_cpu(case, at_once, monk
     np.testing.assert_array_equal(lines.count_lit(), projector.count_lit())
 
 
+@pytest.mark.slow(but="upright")
 def test_entries_are_columns_of_the_matrix(case):
     _, _, projector, matrix = case
     for voxel in (0, matrix.shape[1] // 2):
@@ -153,6 +160,7 @@ def test_entries_are_columns_of_the_matrix(case):
         np.testing.assert_allclose(dense, matrix[:, voxel], atol=ROUNDING * matrix.max())
 
 
+@pytest.mark.slow(but="upright")
 def test_count_of_lit_rays_is_that_of_profiles(case):
     _, weights, projector, _ = case
     plain = SeparableProjector(_without_turns(weights), SETS)
@@ -161,6 +169,7 @@ def test_count_of_lit_rays_is_that_of_profiles(case):
     np.testing.assert_array_equal(projector.count_lit(), expected)
 
 
+@pytest.mark.slow(but="upright")
 def test_largest_weight_bounds_those_of_rays(case):
     _, weights, projector, matrix = case
     plain = reference.separable(_without_turns(weights))

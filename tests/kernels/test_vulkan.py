@@ -29,6 +29,7 @@ def computed(file, arch):
     return np.load(file)
 
 
+@pytest.mark.slow
 def test_results_on_vulkan_are_those_of_the_processor(tmp_path):
     vulkan, processor = computed(tmp_path / "vulkan.npz", "vulkan"), computed(tmp_path / "cpu.npz", "")
     assert set(vulkan) == set(processor) and len(processor.files) == 15

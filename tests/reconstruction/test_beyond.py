@@ -61,6 +61,7 @@ def test_few_particles_at_the_faces_of_single_pairs_are_no_light_beyond(calibrat
     assert [light_beyond(calibration, VOLUME, pairs) for pairs in single] == [()] * len(single)
 
 
+@pytest.mark.slow
 def test_one_camera_shows_no_depth(calibration, weights):
     left = {"left": calibration.cameras["left"]}
     assert light_beyond(Calibration(left), VOLUME, images_of(weights, -HALF_MM, 2 * HALF_MM)) == ()

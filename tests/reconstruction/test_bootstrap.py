@@ -53,6 +53,7 @@ def test_light_adds_up_in_any_number_of_batches(weights, monkeypatch):
         assert np.allclose(parts[name], image, rtol=1e-4, atol=1e-5 * image.max())
 
 
+@pytest.mark.slow(but="30-0.6")
 @pytest.mark.parametrize(("count", "sigma"), [(30, 0.6), (150, 0.8)])
 def test_number_and_size_of_particles_are_found_under_noise(weights, count, sigma):
     imager, instants = ParticleImager(weights, sigma), []
@@ -66,6 +67,7 @@ def test_number_and_size_of_particles_are_found_under_noise(weights, count, sigm
     assert found.noise == NOISE
 
 
+@pytest.mark.slow
 def test_images_without_particles_say_so(weights):
     rng = np.random.default_rng(0)
     noise = {name: rng.standard_normal(camera.optics.sensor_shape) for name, camera in weights.cameras.items()}

@@ -67,6 +67,7 @@ def quality(weights, images, truth, cap):
     return float((volume * truth).sum() / np.sqrt(np.square(volume).sum() * np.square(truth).sum()))
 
 
+@pytest.mark.slow
 def test_counts_are_limited_by_each_pixel_s_gain_and_dim_ones_stay(weights):
     _, images = scene(weights, 1.0, 1)
     before, after = (record(weights, images, floor=None, floor_share=0.1, intensity_cap=cap) for cap in (0.0, CAP))

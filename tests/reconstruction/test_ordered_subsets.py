@@ -230,6 +230,7 @@ def unlike_bright(weights, truth, deviation):
     }
 
 
+@pytest.mark.slow
 def test_auto_takes_larger_subsets_where_cameras_contradict_each_other(volume_of_blobs, caplog):
     weights, truth, images = volume_of_blobs
     unlike = unlike_bright(weights, truth, 1.2)

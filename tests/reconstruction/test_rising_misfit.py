@@ -41,6 +41,7 @@ def misfit_of(weights, images, iterations, **keywords):
     return np.array(plain_steps.reconstruct(weights, images, iterations, **keywords).attrs["misfit"])
 
 
+@pytest.mark.slow(but="60-1-0.5")
 @pytest.mark.parametrize("band", [steps.BAND, NO_BAND])
 @pytest.mark.parametrize(("count", "seed"), [(60, 1), (200, 1), (200, 2), (200, 3)])
 def test_the_misfit_of_many_epochs_ends_at_its_least(oblique, count, seed, band, monkeypatch):

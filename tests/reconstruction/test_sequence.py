@@ -106,6 +106,7 @@ def test_volumes_gain_by_fewer_iterations_if_the_flow_is_known(solver, series):
         assert lost[1] < GAIN * lost[0]
 
 
+@pytest.mark.slow
 def test_an_instant_with_nothing_beside_it_is_that_of_its_images(solver, series):
     _, images, _ = series
     alone = solver.smart.solve(images[0])
@@ -114,6 +115,7 @@ def test_an_instant_with_nothing_beside_it_is_that_of_its_images(solver, series)
     assert np.array_equal(solver.correct(done, 0).volume, alone.volume), "the flow is not known"
 
 
+@pytest.mark.slow
 def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     _, images, _ = series
     rough = vectors_of(FLOW)
@@ -127,6 +129,7 @@ def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     assert np.array_equal(unresolved.correct(done, 2).volume, expected)
 
 
+@pytest.mark.slow
 def test_after_some_flows_that_are_not_resolved_none_is_measured(solver, series):
     _, images, _ = series
     rough = vectors_of(FLOW)

@@ -109,6 +109,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "planes", "subsets"),
     [("profiles", "planes", 4), ("pixels", "planes", 4), ("pixels", "voxels", 1)],

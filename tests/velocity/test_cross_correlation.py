@@ -44,6 +44,7 @@ BIAS = {32: 0.01, 16: 0.01, 8: 0.02}
 """Largest mean error of a component by window edge [voxel]: the figures the product is held to."""
 
 
+@pytest.mark.slow(but="[32 16]")
 @pytest.mark.parametrize("passes", [("32", (32,)), ("32 16", (32, 16)), ("32 16 8", (32, 16, 8))], ids=lambda p: p[0])
 def test_a_uniform_shift_has_no_bias(passes):
     windows = passes[1]
@@ -83,6 +84,7 @@ def test_flows_are_recovered(flow, limit, noisy_limit):
     assert json.loads(result.attrs["passes"])[-1]["valid"] == pytest.approx(float(result["valid"].mean()), abs=1e-4)
 
 
+@pytest.mark.slow(but="24-16")
 @pytest.mark.parametrize(("depth", "window"), [(30, 20), (30, 14), (24, 16)], ids=str)
 def test_few_layers_of_vectors_are_enough(depth, window):
     shape = (depth, 56, 56)
@@ -108,6 +110,7 @@ def test_swapping_the_volumes_negates_the_field():
     np.testing.assert_allclose(forward, -backward, atol=TOLERANCE_PEAK)
 
 
+@pytest.mark.slow(but="[8]")
 @pytest.mark.parametrize("windows", [(32, 16, 16), (32, 16, 8)], ids=["16", "8"])
 def test_the_uncertainty_agrees_with_the_errors(windows):
     flow = uniform(0.7, -1.3, 1.8)

@@ -189,6 +189,7 @@ print((spent >= 0.25 * spent.max()).sum())
 """Program that counts with three threads and prints how many of them worked at least a quarter as long as another."""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not tell the work of a thread")
 def test_several_threads_count():
     """A loop of few turns runs on one of Taichi's threads, see `runtime.TAICHI_SHARE`. A test process has one core."""

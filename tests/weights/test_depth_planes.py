@@ -291,6 +291,7 @@ def test_memory_with_nodes_is_estimated(monkeypatch):
     assert estimate == pytest.approx(weights.memory_bytes, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pose", "lines"),
     [

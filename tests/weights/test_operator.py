@@ -103,6 +103,7 @@ def test_footprint_agrees_with_a_converged_count(name, microlenses):
     assert np.max(errors) <= FOOTPRINT_WORST, errors
 
 
+@pytest.mark.slow(but="aligned-pixels")
 @pytest.mark.parametrize(
     ("name", "form"), [("aligned", "pixels"), ("hexagonal", "pixels"), ("mild coma", "pixels"), ("aligned", "profiles")]
 )
@@ -434,6 +435,7 @@ def test_more_blocks_than_numbers_are_refused(small, monkeypatch):
         lfpiv.build_weights(IdealRig(small.cameras), small.grid, form="profiles")
 
 
+@pytest.mark.slow
 def test_memory_estimate_holds_before_building():
     rig = two_cameras(optics=optics(rows=100, columns=110))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 2.0), voxel_mm=0.05)

@@ -60,6 +60,7 @@ def test_profiles_are_shared_where_rows_of_lenses_are_level(both):
     assert shared.memory_bytes < 0.7 * every.memory_bytes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cameras",
     [
@@ -183,6 +184,7 @@ def test_rows_of_pixels_see_all_of_the_light_once(both):
         assert light.sum() == pytest.approx((image * shared.gain(name))[pixels].sum(), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_overlapping_microimages_are_not_taken_row_by_row(device):
     """Most pixels see rays of two lenses there, and so of two sets of rows: subsets are whole cameras."""
     wide = [
