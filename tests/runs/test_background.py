@@ -54,22 +54,20 @@ def edited(experiment, old, new):
 def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path, monkeypatch):
     experiment, _ = lit(small_run, tmp_path / "data")
     whole, part = (small_run.calibrated(tmp_path / name) for name in ("whole", "part"))
-    summary = pipeline.run(experiment, whole, pairs=(0, 2))
+    summary = pipeline.run(experiment, whole, pairs=(0, 1))
     assert set(summary["background"]) == {"left", "right"}
     assert (whole / "report.html").read_text("utf-8").count("Light that stands still in left, frame") == 2
     assert all(0.02 < figures["standing_share"] < 0.5 for figures in summary["background"].values())
     assert not any("stands still" in text or "moved" in text for text in summary["warnings"])
-    for pair in (0, 1):
-        np.testing.assert_allclose(mean_displacement(whole, pair), DISPLACEMENT_VOXEL, atol=TOLERANCE_VOXEL)
+    np.testing.assert_allclose(mean_displacement(whole, 0), DISPLACEMENT_VOXEL, atol=TOLERANCE_VOXEL)
     monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
     written = (whole / "background.h5").stat().st_mtime_ns
-    again = pipeline.run(experiment, whole, pairs=(0, 2))
-    assert "vectors of pair 1" in again["reused"] and again["background"] == summary["background"]
+    again = pipeline.run(experiment, whole, pairs=(0, 1))
+    assert "vectors of pair 0" in again["reused"] and again["background"] == summary["background"]
     assert (whole / "background.h5").stat().st_mtime_ns == written
-    for pair in (0, 1):  # one pair at a time, in steps
-        pipeline.reconstruct(experiment, part, pairs=(pair, pair + 1))
-        pipeline.correlate(experiment, part, pairs=(pair, pair + 1))
-    assert same_vectors(whole, part) == 2
+    pipeline.reconstruct(experiment, part, pairs=(0, 1))
+    pipeline.correlate(experiment, part, pairs=(0, 1))
+    assert same_vectors(whole, part) == 1
 
 
 @pytest.mark.slow

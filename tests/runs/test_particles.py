@@ -30,6 +30,7 @@ def test_particles_without_partners_are_told(linked, expected):
     assert all("40 %" in warning.sentence for warning in found)
 
 
+@pytest.mark.slow
 def test_each_instant_of_a_series_is_fitted_once_with_equal_tables(small_run, tmp_path, monkeypatch):
     fitted, fit = [], ParticleSearch.fit
     monkeypatch.setattr(ParticleSearch, "fit", lambda *given, **named: fitted.append(1) or fit(*given, **named))

@@ -291,6 +291,7 @@ def test_light_that_stays_in_place_is_left_out():
     assert (first > 0).sum() == (second > 0).sum() == 1 and first[5, 6] > 0 and second[8, 9] > 0
 
 
+@pytest.mark.slow
 def test_particles_that_hardly_move_between_the_frames_of_a_pair_are_no_still_light(small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
     for folder in (file.parent / "particles").iterdir():
