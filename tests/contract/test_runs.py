@@ -5,6 +5,7 @@ import shutil
 import signal
 
 import numpy as np
+import pytest
 import xarray as xr
 from contract.command import done
 from contract.scene import DISPLACEMENT_VOXEL, DT_S, VOXEL_MM
@@ -73,6 +74,7 @@ def test_a_finished_run_repeats_nothing(run, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in sorted(out.rglob("*.nc"))} == before
 
 
+@pytest.mark.slow
 def test_vectors_of_a_series_beside_a_wall(series, stored, loops):
     results = open_results(series.out)
     assert results.instant.values.tolist() == [0, 1, 2]
@@ -83,6 +85,7 @@ def test_vectors_of_a_series_beside_a_wall(series, stored, loops):
     stored.check("series: vectors", loops, arrays(results))
 
 
+@pytest.mark.slow
 def test_tracks_of_a_series(series, stored, loops):
     tracks = open_tracks(series.out)
     kept = tracks.valid.values

@@ -10,6 +10,7 @@ PARTICLES = 0.05
 """The same for particles: rounds of fitting, removing and adding them amplify it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", NAMES)
 def test_bits_are_those_stored(case, computed, stored):
     one, two, gpu = (computed[way][case] for way in ("one thread", "two threads", "loops for a GPU"))

@@ -52,6 +52,7 @@ def rejected(caplog):
     return sorted({line.split(": damaged")[0].rsplit("/", 1)[1] for line in lines})
 
 
+@pytest.mark.slow
 def test_forged_vectors_are_named_and_made_again(small_run, out, caplog):
     """The volumes are whole, so that only the correlation is done again."""
     reference = small_run.out

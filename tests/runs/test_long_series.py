@@ -1,7 +1,6 @@
 """Campaigns of a hundred thousand pairs: found one after the other, cut for workers, summed up without lists of all."""
 
 import json
-import random
 import tracemalloc
 from operator import length_hint
 
@@ -64,27 +63,6 @@ def test_pairs_of_a_series_come_along_its_chains():
     assert list(todo) == [0, 3, 6, 1, 4, 2, 5]
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_stretches_hold_every_pair_once_and_every_instant_in_one(seed):
-    rng = random.Random(seed)
-    step, workers = rng.randint(1, 3), rng.randint(1, 4)
-    chosen = {pair for pair in range(rng.randint(1, 120)) if rng.random() < 0.9} or {0}
-    todo = sorted(chosen, key=lambda pair: (pair % step, pair))
-    found = list(stretches.cut(todo, step, workers))
-    inner = [pair for stretch in found for pair in stretch.pairs]
-    seams = [pair for stretch in found for pair in stretch.seams]
-    assert sorted(inner + seams) == sorted([*chosen, *set(seams)])  # a seam is named by both stretches beside it
-    assert all(seams.count(pair) == 2 for pair in seams) and not set(inner) & set(seams)
-    for stretch in found:
-        assert (
-            list(stretch.pairs) == list(range(stretch.pairs[0], stretch.pairs[-1] + 1, step)) if stretch.pairs else True
-        )
-        assert len(stretch.pairs) + 1 <= stretches.MOST_INSTANTS
-    assert all(stretch.pairs for stretch in found)
-    reconstructed = [instant for stretch in found for instant in (*stretch.pairs, stretch.pairs[-1] + step)]
-    assert len(reconstructed) == len(set(reconstructed))
-
-
 def test_stretches_are_cut_as_they_are_needed():
     taken = []
     source = (taken.append(pair) or pair for pair in range(MANY))
@@ -136,6 +114,7 @@ def test_images_that_stand_in_two_pairs_under_two_names_are_copies(tmp_path):
     assert kept.copies() == {}
 
 
+@pytest.mark.slow
 def test_memory_is_bytes_per_pair(tmp_path):
     """Figures, warnings and the search of a hundred thousand pairs, half of them finished."""
     tracemalloc.start()
@@ -173,6 +152,7 @@ def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path
     assert 0 < len(asked) <= 100 and length_hint(todo) == MANY - 1 and peak < BYTES_PER_PAIR * MANY
 
 
+@pytest.mark.slow
 @pytest.mark.whole_report
 def test_a_summary_of_many_pairs_lists_some_and_names_the_file_of_all(small_run, tmp_path, monkeypatch):
     out = small_run.results(tmp_path / "out")

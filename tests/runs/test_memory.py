@@ -90,6 +90,7 @@ def test_a_sequence_holds_the_instants_between_those_of_a_pair(small_run):
     assert needed(1, predicting) > needed(1, experiment.smart)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [False, True], ids=["blocks", "shared profiles"])
 def test_the_estimate_has_room_for_what_a_solver_keeps_and_works_on(shared, device, monkeypatch):
     """Both volumes are held, as in a run; two cameras whose rays are cut into four subsets, or into rows of pixels."""

@@ -36,7 +36,7 @@ def test_each_instant_of_a_series_is_fitted_once_with_equal_tables(small_run, tm
     monkeypatch.setattr(ParticleSearch, "fit", lambda *given, **named: fitted.append(1) or fit(*given, **named))
     made = make_work(small_run, write_series(small_run, tmp_path / "data"), tmp_path / "made")
     experiment = dataclasses.replace(made.experiment, tracking=Tracking(rounds=1))
-    made, pairs = dataclasses.replace(made, experiment=experiment), range(FIRST, FIRST + 3)
+    made, pairs = dataclasses.replace(made, experiment=experiment), range(FIRST, FIRST + 2)
     together, apart = (changed(made, tmp_path / name, instants=len(pairs) + 1) for name in ("together", "apart"))
     assert not any(outcome.reason for outcome in together.do(pairs, lambda number, fraction: None))
     assert len(fitted) == len(pairs) + 1

@@ -120,6 +120,7 @@ def test_an_instant_follows_from_the_beginning_of_its_segment(first, instants, d
     assert segments.depended_on(series, instant) == [one for one in range(found[0], later + 1) if one != instant]
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference, tmp_path, solved):
     work = changed(made[1], tmp_path / "out", instants=INSTANTS)
     for pair in reversed(work.experiment.numbers):  # each in an invocation of its own, the last one first
@@ -131,6 +132,7 @@ def test_the_numbers_are_those_of_one_process_for_any_beginning(made, reference,
     assert solved["volumes"] == INSTANTS + 4, "two instants lead in, and two correct the last ones of their segments"
 
 
+@pytest.mark.slow
 def test_a_segment_whose_flow_is_given_up_has_the_numbers_of_instants_by_themselves(
     made, tmp_path, solved, monkeypatch
 ):
@@ -141,9 +143,6 @@ def test_a_segment_whose_flow_is_given_up_has_the_numbers_of_instants_by_themsel
     assert solved["volumes"] == INSTANTS + 2, "two instants lead in; none after a segment is reconstructed"
     sequential(predicting(changed(work, tmp_path / "alone", instants=INSTANTS), False))
     assert same_vectors(tmp_path / "alone", tmp_path / "out") == INSTANTS - 1
-    for pair in reversed(work.experiment.numbers):
-        assert not sequential(changed(work, tmp_path / "again", instants=INSTANTS), [pair])[0].reason
-    assert same_vectors(tmp_path / "alone", tmp_path / "again") == INSTANTS - 1
 
 
 def warnings_of(folder):
@@ -151,10 +150,10 @@ def warnings_of(folder):
         yield from provenance.read_marks(path).warnings
 
 
-@pytest.mark.parametrize("workers", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_the_numbers_are_those_of_one_process_for_several_workers_and_deaths(made, reference, tmp_path, workers):
+@pytest.mark.slow
+def test_the_numbers_are_those_of_one_process_for_several_workers_and_deaths(made, reference, tmp_path):
     work = changed(made[1], tmp_path / "out", instants=INSTANTS, scratch=tmp_path / "scratch")
-    outcomes, client = in_segments(work, workers, {FIRST: [1]})
+    outcomes, client = in_segments(work, 3, {FIRST: [1]})
     assert sorted(outcomes) == list(work.experiment.numbers) and not any(one.reason for one in outcomes.values())
     assert any(stretch.seams for stretch in client.submitted)
     assert client.submitted.count(client.submitted[0]) == 2, "a worker died"
@@ -162,22 +161,22 @@ def test_the_numbers_are_those_of_one_process_for_several_workers_and_deaths(mad
     assert same_vectors(reference, tmp_path / "out") == INSTANTS - 1
 
 
-@pytest.mark.parametrize("step", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_the_step_changes_no_volume(made, reference, tmp_path, step):
+@pytest.mark.slow
+def test_the_step_changes_no_volume(made, reference, tmp_path, step=2):
     one = changed(made[1], tmp_path / "one", step=step, instants=INSTANTS, keep_volumes=True)
     assert not any(outcome.reason for outcome in sequential(one))
     found, expected = volumes(tmp_path / "one"), volumes(reference)
     used = {frame.number for pair in one.experiment.numbers for frame in one.experiment.pair_frames(pair)}
     assert list(found) == [name(instant - FIRST) for instant in sorted(used)]
     assert all(np.array_equal(found[name], expected[name]) for name in found)
-    if step == 2:  # seams whose two instants are both within a segment of pairs to do
-        many = changed(one, tmp_path / "many", step=step, instants=INSTANTS, scratch=tmp_path / "scratch")
-        many = dataclasses.replace(many, keep_volumes=False)
-        outcomes, _ = in_segments(many, 2)
-        assert not any(one.reason for one in outcomes.values())
-        assert same_vectors(tmp_path / "one", tmp_path / "many") == INSTANTS - step
+    # seams whose two instants are both within a segment of pairs to do
+    many = changed(one, tmp_path / "many", step=step, instants=INSTANTS, scratch=tmp_path / "scratch")
+    outcomes, _ = in_segments(dataclasses.replace(many, keep_volumes=False), 2)
+    assert not any(one.reason for one in outcomes.values())
+    assert same_vectors(tmp_path / "one", tmp_path / "many") == INSTANTS - step
 
 
+@pytest.mark.slow
 def test_without_prediction_an_instant_depends_on_its_images_only(made, reference, tmp_path):
     work = changed(predicting(made[1], False), tmp_path / "out", instants=INSTANTS, keep_volumes=True)
     sequential(work, [FIRST + 4])
@@ -213,6 +212,7 @@ def test_a_new_image_concerns_one_before_the_rest_of_its_segment_and_what_it_lea
     assert changed_since() == [4, 5, 6, 7, 8]
 
 
+@pytest.mark.slow
 def test_after_a_bad_or_repeated_image_the_sequence_begins_anew(made, small_run, tmp_path):
     file = write_series(small_run, tmp_path / "data")
     damage(file.parent / f"run/left/{FIRST + 1:05d}.tif")
