@@ -25,11 +25,11 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.optics import LensLattice as LensLattice
     from lfpiv.geometry.optics import Optics as Optics
     from lfpiv.geometry.resampling import volume_on as volume_on
+    from lfpiv.joint.pair import reconstruct_pair as reconstruct_pair
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.planning.campaign import plan as plan
     from lfpiv.reconstruction.bootstrap import measure_damping as measure_damping
-    from lfpiv.reconstruction.motion import reconstruct_pair as reconstruct_pair
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
@@ -72,7 +72,7 @@ _MODULES = {
     "plan": "lfpiv.planning.campaign",
     "prepare": "lfpiv.runs.measurement",
     "reconstruct": "lfpiv.reconstruction.volume",
-    "reconstruct_pair": "lfpiv.reconstruction.motion",
+    "reconstruct_pair": "lfpiv.joint.pair",
     "run": "lfpiv.runs.pipeline",
     "self_calibrate": "lfpiv.selfcalibration.movements",
     "thin_lens": "lfpiv.calibration.cameras",

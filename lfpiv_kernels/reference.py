@@ -326,3 +326,16 @@ def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shor
             ahead, last = following * ratio ** min((time - 1) / later, momentum), following
             time = later
     return ahead
+
+
+def transport(moved, share=1.0):
+    """Matrix of `lfpiv_kernels.reconstruction.transport`: column k is voxel k moved by share * moved, (3, z, y, x)."""
+    shape = moved.shape[1:]
+    columns = []
+    for voxel, d in zip(np.ndindex(*shape), share * moved.reshape(3, -1).T.astype(float), strict=True):
+        weights = []
+        for place, count in zip(np.add(voxel, d), shape, strict=True):
+            far = np.abs(np.arange(count) - place)
+            weights.append(np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, np.maximum(2 - far, 0) ** 3 / 6))
+        columns.append(np.einsum("z,y,x->zyx", *weights).ravel())
+    return np.stack(columns, axis=1)

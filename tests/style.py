@@ -59,6 +59,7 @@ MAY_IMPORT = {
     "weights": {"calibration", "lightfield"},
     "reconstruction": {"weights", "calibration", "lightfield", "velocity"},
     "tracking": {"reconstruction", "weights", "calibration", "metrics"},
+    "joint": {"reconstruction", "weights", "velocity"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
 }

@@ -128,10 +128,10 @@ def check_tables(path: Path, table: ExperimentTable) -> None:
         if one.background_image is not None:
             _check_background(path, one, particles)
     series = particles.series
-    if series is not None and table.smart.motion_passes:
+    if table.smart.estimate == "joint" and (series is not None or len(table.camera) < 2):
+        where = "a time series, where each instant is reconstructed once" if series is not None else "a single camera"
         raise InputError(
-            f"{path}: smart.motion_passes: expected 0 for a time series, where each instant is reconstructed once and "
-            f"used in two pairs, found {table.smart.motion_passes}. Set it to 0."
+            f"{path}: smart.estimate: expected 'correlation' for {where}, found 'joint'. Set it to 'correlation'."
         )
 
 

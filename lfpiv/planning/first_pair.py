@@ -102,7 +102,7 @@ def measure(run: Run, calibration: Calibration, scratch: Path, *, calibrated: bo
     both = PairVolumes(frames=volumes, names=experiment.frames if experiment.series is None else ("a", "b"))
     file = replace(run, folder=Folder(scratch, experiment.series)).files(experiment.numbers[0])
     _, written = timed(lambda: _write(vectors, both, file, experiment))
-    plain = 1 + experiment.smart.motion_passes
+    plain = 3 if experiment.smart.estimate == "joint" else 1
     return FirstPair(
         weights=built,
         cameras=cameras,

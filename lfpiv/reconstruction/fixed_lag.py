@@ -25,8 +25,8 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.dark_voxels import without_dark
+from lfpiv.reconstruction.motion_field import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv.reconstruction.shared_light import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv_kernels import runtime
 

@@ -12,8 +12,8 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import MASKED, VIEWS
+from lfpiv.reconstruction.motion_field import SMOOTHING_VOXEL
 from lfpiv.reconstruction.settings import SmartSettings
-from lfpiv.reconstruction.shared_light import SMOOTHING_VOXEL
 from lfpiv_kernels.correlation import deform, light
 
 

@@ -34,9 +34,8 @@ from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.instant import PreparedInstant
-from lfpiv.reconstruction.motion import LEAST_VALID
+from lfpiv.reconstruction.motion_field import LEAST_VALID, MotionField
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv.reconstruction.shared_light import MotionField
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.settings.processing import Correlation

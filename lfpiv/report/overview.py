@@ -103,7 +103,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
             + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
         _recorded(experiment, summary.finished_count),
-        ("Motion passes", _motion(summary)),
+        ("Joint fit", _joint(summary)),
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
         ("Damping by ghosts", _damping(summary.damping)),
@@ -150,16 +150,16 @@ def _orientation(camera: CameraSetup) -> str:
     return " in any orientation" if camera.orientation is None else f" {camera.orientation}".replace("-", "−")
 
 
-def _motion(summary: Summary) -> str:
-    """State in how many pairs the motion passes followed the motion; empty without motion passes."""
-    passes = summary.settings["smart"].get("motion_passes", 0)
-    if not passes:
+def _joint(summary: Summary) -> str:
+    """State how many pairs were fitted jointly and how many of their vectors; empty without a joint fit."""
+    fits = [pair.joint for pair in summary.pairs if pair.joint is not None and pair.joint.fitted]
+    if summary.settings["smart"].get("estimate") != "joint":
         return ""
-    followed = sum(pair.motion.followed for pair in summary.pairs)
-    return (
-        f"{passes}: the motion was followed in {markup.count(followed, 'pair')} of {len(summary.pairs):,}; the "
-        "uncertainty is that of volumes reconstructed frame by frame"
-    )
+    text = f"{markup.count(len(fits), 'pair')} of {len(summary.pairs):,}"
+    if fits:
+        share, ratio = np.mean([fit.share for fit in fits]), np.median([fit.misfit_ratio for fit in fits])
+        text += f"; {percent(float(share))} of the valid vectors; misfit {ratio:.2f} of that of each frame by itself"
+    return text
 
 
 def _weights(weights: WeightFigures) -> str:

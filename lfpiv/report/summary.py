@@ -69,10 +69,12 @@ class Spread(_Figures):
     sd: float | None
 
 
-class MotionFigures(_Figures):
-    """Outcome of the motion passes of a pair."""
+class JointFigures(_Figures):
+    """Outcome of the joint fit of a pair."""
 
-    followed: bool = False
+    fitted: bool = False
+    misfit_ratio: float = 1.0
+    share: float = 0.0
 
 
 class ParticleFigures(_Figures):
@@ -102,7 +104,7 @@ class PairFigures(_Figures):
     uncertainty_voxel: float | None
     peak_ratio: float | None
     moved_voxel: float | None = None
-    motion: MotionFigures = MotionFigures()
+    joint: JointFigures | None = None
     residual: dict[str, tuple[float, ...]] = {}
     stop: dict[str, str] = {}
     structure: dict[str, dict[str, float]] = {}

@@ -28,7 +28,7 @@ class PairStamps:
     """Stamps of the results of one pair."""
 
     volumes: tuple[Stamp, Stamp]
-    """Of both frames; the same for both frames of an image pair, which motion passes reconstruct together."""
+    """Of both frames; the same for both frames of an image pair, which a joint fit reconstructs together."""
     vectors: Stamp
     particles: Stamp | None = None
     """Of the linked particles; None without tracking."""
@@ -261,7 +261,7 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None) 
         "volume": dataclasses.asdict(experiment.grid),
         "mask": _mask(experiment),
         "smart": experiment.smart.model_dump(),
-        "motion": reach if experiment.smart.motion_passes or experiment.in_sequence else None,
+        "motion": reach if experiment.smart.estimate == "joint" or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
         "particles": particles,
         "images": None,

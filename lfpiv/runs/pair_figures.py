@@ -16,8 +16,8 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import files, warn
+from lfpiv.joint.pair import Estimate
 from lfpiv.prompt import movement
-from lfpiv.reconstruction.motion import Motion
 from lfpiv.records import RecordError, validate
 from lfpiv.results import netcdf
 from lfpiv.results.provenance import Marks
@@ -40,13 +40,16 @@ class Spread:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotionFigures:
-    """Outcome of the motion passes."""
+class JointFigures:
+    """Outcome of the joint fit of a pair."""
 
     verdict: str
-    followed: bool
-    valid_fraction: Sequence[float]
-    """Share of valid vectors before each pass."""
+    fitted: bool
+    rounds: int = 0
+    misfit_ratio: float = 1.0
+    """Misfit over that of the frames by themselves."""
+    share: float = 0.0
+    """Share of the valid vectors that are means of the fitted displacement; the others are those of the correlation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +81,8 @@ class PairFigures:
     """Median length of the displacements of the valid vectors; None where there are none."""
     flow_voxel: Sequence[float] | None = None
     """Mean displacement of the valid vectors, along x, y, z in each eighth of the volume, 0 where there are none."""
-    motion: MotionFigures | None = None
-    """None without motion passes."""
+    joint: JointFigures | None = None
+    """None without a joint fit."""
     residual: Mapping[str, Sequence[float]] | None = None
     """Frame -> residual before each iteration and after the last one."""
     structure: ByFrame | None = None
@@ -175,7 +178,7 @@ def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterabl
         flow_voxel=flow_in_eighths(vectors, valid & finite),
         uncertainty_voxel=_median(vectors["uncertainty"].values[valid]),
         peak_ratio=_median(vectors["peak_ratio"].values[valid]),
-        motion=_motion(vectors.attrs) if "motion" in vectors.attrs else None,
+        joint=_joint(vectors.attrs) if "estimate" in vectors.attrs else None,
         **known,
     )
 
@@ -190,11 +193,16 @@ def flow_in_eighths(vectors: xr.Dataset, counts: np.ndarray) -> list[float]:
     return means
 
 
-def _motion(attributes: Mapping[str, Any]) -> MotionFigures:
-    return MotionFigures(
-        verdict=str(attributes["motion"]),
-        followed=attributes["motion"] == Motion.FOLLOWED.value,
-        valid_fraction=np.atleast_1d(attributes["motion_valid"]).tolist(),
+def _joint(attributes: Mapping[str, Any]) -> JointFigures:
+    fitted = attributes["estimate"] == Estimate.JOINT.value
+    if not fitted:
+        return JointFigures(verdict=str(attributes["estimate"]), fitted=False)
+    return JointFigures(
+        verdict=str(attributes["estimate"]),
+        fitted=True,
+        rounds=int(attributes["rounds"]),
+        misfit_ratio=float(attributes["misfit_ratio"]),
+        share=float(attributes["joint_fraction"]),
     )
 
 

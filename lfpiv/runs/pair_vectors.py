@@ -1,19 +1,16 @@
 """Vectors of a pair: correlate its volumes and state what the vectors cannot show.
 
-The motion passes share light between the frames, and a camera may have recorded no particles: both change what the
-vectors are worth.
+A camera may have recorded no particles, which changes what the vectors are worth.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import xarray as xr
 
 from lfpiv.experiment.experiment import Experiment
+from lfpiv.joint.vectors import joint_vectors
 from lfpiv.lightfield import image_checks
-from lfpiv.reconstruction.motion import Motion, unshared_quality
 from lfpiv.results.pair_files import PairVolumes
-from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import Code, collected
 
 NO_PARTICLES = "no particles in the images: none of the vectors counts"
@@ -28,10 +25,12 @@ REFUSED = (NO_PARTICLES, MISPLACED, UNLIKE_PARTICLES)
 
 
 def measure_vectors(first: xr.DataArray, second: xr.DataArray, experiment: Experiment) -> xr.Dataset:
-    """Correlate the volumes of two frames. That few vectors are valid is not logged: the pair may be refused."""
+    """Return the vectors of two frames, of a joint fit or of the correlation of both volumes.
+
+    That few vectors are valid is not logged: the pair may be refused.
+    """
     with collected(quiet=True):
-        vectors = correlate(first, second, dt_s=experiment.dt_s, **experiment.correlation.model_dump())
-    return _with_motion(vectors, (first, second))
+        return joint_vectors((first, second), dt_s=experiment.dt_s, **experiment.correlation.model_dump())
 
 
 def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
@@ -57,12 +56,3 @@ def refused(vectors: xr.Dataset, verdict: str) -> xr.Dataset:
     seen = vectors.attrs["seen_fraction"]  # no part of the volume is blamed for it
     attributes = {"valid_fraction": 0.0, "measurable_fraction": seen, "unseeded_fraction": 0.0}
     return vectors.assign(changed).assign_attrs(verdict=verdict, **attributes)
-
-
-def _with_motion(vectors: xr.Dataset, volumes: tuple[xr.DataArray, xr.DataArray]) -> xr.Dataset:
-    """Return vectors with the outcome of the motion passes and with a quality that does not count shared light."""
-    attributes = volumes[0].attrs
-    if attributes.get("motion", Motion.OFF.value) == Motion.OFF.value:
-        return vectors
-    shares = np.atleast_1d(attributes["motion_valid"]).tolist()
-    return unshared_quality(vectors, volumes).assign_attrs(motion=attributes["motion"], motion_valid=shares)

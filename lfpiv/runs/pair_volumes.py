@@ -21,14 +21,13 @@ from lfpiv.experiment.experiment import Experiment, Frame
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
+from lfpiv.joint.pair import PairSolver
 from lfpiv.progress import StepProgress
-from lfpiv.reconstruction.motion import PairSolver
 from lfpiv.reconstruction.sequence import Before, SequenceSolver, Solved, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.settings.processing import DEFAULT_WINDOWS, Correlation
-from lfpiv.velocity.settings import FIRST_SEARCH
+from lfpiv.settings.processing import Correlation
 from lfpiv.warn import Code, Warning
 
 if TYPE_CHECKING:
@@ -67,19 +66,14 @@ class Reconstructor:
     def solver(self) -> PairSolver:
         """SMART for this rig, made once for all pairs.
 
-        The motion passes use default windows, so that other windows in `[correlation]` do not change the volumes. They
-        correlate the reconstructed voxels.
+        The joint fit starts from default windows, so that other windows in `[correlation]` do not change the volumes.
         """
         self.weights.volume = self.experiment.grid
         smart, farthest = self.experiment.smart, self.experiment.correlation.max_displacement_voxel
-        if farthest is None and self.refinement > 1:
-            farthest = FIRST_SEARCH * DEFAULT_WINDOWS[0]
-        if farthest is not None:
-            farthest *= self.refinement
         return PairSolver(
             self.weights,
             SmartSettings(**smart.of_one_frame(self.refinement)),
-            motion_passes=smart.motion_passes,
+            estimate=smart.estimate,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
         )
 
@@ -123,11 +117,9 @@ class Reconstructor:
             result = solver.solve([frame.images for frame in light], floors, progress, masks=masks)
         except ValueError as error:
             raise InputError(f"pair {pair}: {error}") from error
-        if solver.motion_passes:
-            log.info("pair %d: %s", pair, result.motion.value)
-        volumes = result.to_dataarrays()
+        volumes = [_without_views(volume) for volume in result.to_dataarrays(self.experiment.grid)]
         seconds = (time.perf_counter() - start) / 2
-        first, second = (self._frame(volume, frame, seconds) for volume, frame in zip(volumes, light, strict=True))
+        first, second = (self._record(volume, frame, seconds) for volume, frame in zip(volumes, light, strict=True))
         return first, second
 
     def instant(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
@@ -188,17 +180,20 @@ class Reconstructor:
         """
         masks = [self.solid(frame) for frame in frames]
         if self.experiment.series is None:
-            first, second = self.solver.solve(images, noise, masks=masks).to_dataarrays()
-        else:
-            first, second = (
-                self.solver.smart.solve(one, floor=floor, mask=mask).to_dataarray()
-                for one, floor, mask in zip(images, noise, masks, strict=True)
-            )
+            both = self.solver.solve(images, noise, masks=masks).to_dataarrays(self.experiment.grid)
+            return _without_views(both[0]), _without_views(both[1])
+        first, second = (
+            self.solver.smart.solve(one, floor=floor, mask=mask).to_dataarray()
+            for one, floor, mask in zip(images, noise, masks, strict=True)
+        )
         return _as_written(first, self.experiment.grid), _as_written(second, self.experiment.grid)
 
     def _frame(self, found: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
         """Return a volume on the voxels of the experiment, with its record."""
-        volume = _as_written(found, self.experiment.grid)
+        return self._record(_as_written(found, self.experiment.grid), light, seconds)
+
+    def _record(self, volume: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
+        """Return a written volume with its record."""
         record = FrameRecord(structure=light.structure, warnings=light.warnings, seconds=seconds + light.seconds)
         return FrameVolume(volume=volume, record=record)
 
@@ -216,7 +211,11 @@ def reconstruction_s(experiment: Experiment, pair: int, volumes: PairVolumes) ->
 
 def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     """Return a reconstructed volume on the voxels that are written, ``views`` only if some are seen by one camera."""
-    written = volume_on(volume, grid)
-    if VIEWS in written.coords and written.coords[VIEWS].values.min() >= 2:
-        written = written.drop_vars(VIEWS)
-    return written
+    return _without_views(volume_on(volume, grid))
+
+
+def _without_views(volume: xr.DataArray) -> xr.DataArray:
+    """Return a volume with ``views`` only if some voxels are seen by one camera."""
+    if VIEWS in volume.coords and volume.coords[VIEWS].values.min() >= 2:
+        volume = volume.drop_vars(VIEWS)
+    return volume

@@ -132,7 +132,7 @@ def coarsened(experiment: Experiment) -> Experiment:
     coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(max(x, edge), max(y, edge), max(z, edge)), voxel_mm=edge)
     # particles are smaller than these voxels: their size, measured for the sieve and the limit, would say nothing
     measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if getattr(experiment.smart, key) == "auto"}
-    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "motion_passes": 0, **measured})
+    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "estimate": "correlation", **measured})
     return replace(experiment, grid=coarse, smart=smart)
 
 

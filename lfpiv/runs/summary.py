@@ -380,11 +380,9 @@ def _of_pair(pair: int, figures: PairFigures) -> Iterator[Warning]:
     residual = max((history[-1] for history in (figures.residual or {}).values() if history), default=0.0)
     if residual > LARGE_RESIDUAL:
         yield Warning(code=Code.UNEXPLAINED, pairs=(pair,), figures={"residual": residual})
-    motion = figures.motion
-    if motion is not None and not motion.followed:
-        shares = motion.valid_fraction
-        words = {"passes": str(len(shares)), "share": shares[-1], "verdict": motion.verdict}
-        yield Warning(code=Code.MOTION_LOST, pairs=(pair,), figures=words)
+    joint = figures.joint
+    if joint is not None and not joint.fitted:
+        yield Warning(code=Code.NOT_JOINT, pairs=(pair,), figures={"verdict": joint.verdict})
     if figures.verdict != Verdict.GOOD.value:
         yield figures.few_valid_warning(pair)
     if figures.lost_unseeded > 0:

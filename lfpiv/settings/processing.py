@@ -52,9 +52,10 @@ class Smart(Table):
     follows from the particles' size in the images, and is 1 where they are large enough."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
-    motion_passes: Annotated[int, Field(strict=True, ge=0, le=10)] = 0
-    """Number of times the motion is measured and both frames are reconstructed again from their common light along it;
-    0 reconstructs each frame separately."""
+    estimate: Literal["correlation", "joint"] = "correlation"
+    """How the displacement of an image pair is estimated: from the correlation of two volumes, each reconstructed from
+    its own images, or by a fit of one volume and its displacement to the images of both frames, which needs two or more
+    cameras."""
     predict: Flag = False
     """Whether an instant of a time series starts from the one before, moved by the flow, and is corrected by those
     beside it; it takes fewer iterations."""
@@ -64,7 +65,7 @@ class Smart(Table):
 
         `refinement` is the edge of a voxel over the edge of a reconstructed voxel, in which the sieve is returned.
         """
-        settings = self.model_dump(exclude={"motion_passes", "predict", "refinement"})
+        settings = self.model_dump(exclude={"estimate", "predict", "refinement"})
         sieve = settings["sieve_voxel"]
         return settings | {"sieve_voxel": sieve if sieve == "auto" else sieve * refinement}
 

@@ -259,8 +259,8 @@ class Scene(Table):
             return self
         if isinstance(flow, Tracers) and flow.as_given and not of_series:
             raise ValueError("flow.series for tracers that move as_given in a time series: first and second are two")
-        if self.smart.motion_passes:
-            raise ValueError("smart.motion_passes = 0 with a time series")
+        if self.smart.estimate == "joint":
+            raise ValueError("smart.estimate = 'correlation' with a time series")
         return self
 
     @model_validator(mode="after")

@@ -62,7 +62,7 @@ class Code(enum.Enum):
     # volumes and vectors
     DIVERGED = "diverged"
     UNEXPLAINED = "unexplained"
-    MOTION_LOST = "motion_lost"
+    NOT_JOINT = "not_joint"
     FEW_VALID = "few_valid"
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
@@ -253,7 +253,7 @@ SENTENCES: Mapping[Code, str] = {
         "the volumes explain little of the images' light (residual {residual:.2f}; 0.3 to 0.6 is usual): do not rely "
         "on their vectors before the report shows why"
     ),
-    Code.MOTION_LOST: "motion pass {passes}: {share:percent} % valid; {verdict}",
+    Code.NOT_JOINT: "no joint fit, vectors of the correlation: {verdict}",
     Code.NOT_FOLLOWED: (
         "the particles are not where the instant before and the flow put them (the misfit is {ratio:.2f} times that of "
         "particles in other places), so the volume starts from its images alone. Check the laser's pulses, and whether "

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from lfpiv.calibration.camera import Calibration
 from lfpiv.calibration.cameras import thin_lens
 from lfpiv.calibration.thin_lens_model import thin_lens_model
+from lfpiv.joint.pair import reconstruct_pair
 from lfpiv.progress import Progress
-from lfpiv.reconstruction.motion import reconstruct_pair
 from lfpiv.reproduce import page, plots, rigs, store
 from lfpiv.settings.processing import Correlation, Smart
 
@@ -86,7 +86,7 @@ OWN = {
     "no_momentum": Choice(label="SMART without momentum", smart={"accelerate": False}),
     "ten_iterations": Choice(label="10 SMART iterations", smart={"iterations": 10}),
     "no_sieve": Choice(label="no sieve: voxels of any brightness", smart={"sieve_voxel": 0.0}),
-    "motion_pass": Choice(label="one motion pass: both frames at once", smart={"motion_passes": 1}, both_frames=True),
+    "joint": Choice(label="joint fit of both frames", smart={"estimate": "joint"}, both_frames=True),
     "unsmoothed": Choice(
         label="no sieve, and volumes correlated unsmoothed",
         smart={"sieve_voxel": 0.0},
@@ -232,7 +232,7 @@ def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray
             levels = {camera: weights.cameras[camera].decoder.background(images[camera]) for camera in bench.TWO}
             light.append({camera: images[camera] - np.float32(level) for camera, (level, _) in levels.items()})
             noise.append({camera: deviation for camera, (_, deviation) in levels.items()})
-        found = reconstruct_pair(weights, light, floor=noise, motion_passes=smart.motion_passes, **smart.of_one_frame())
+        found = reconstruct_pair(weights, light, floor=noise, estimate=smart.estimate, **smart.of_one_frame())
         return {
             "volumes": np.stack([volume.values for volume in found]),
             "iterations": np.mean([volume.attrs["iterations"] for volume in found]),

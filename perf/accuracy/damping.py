@@ -30,8 +30,8 @@ from reconstruction_ways import weights_of
 from lfpiv.geometry.grid import Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import lies_in
+from lfpiv.joint.pair import PairSolver
 from lfpiv.reconstruction import bootstrap
-from lfpiv.reconstruction.motion import PairSolver
 from lfpiv.reconstruction.particle_light import LightField
 from lfpiv.reconstruction.refinement import measure_size, needed_refinement
 from lfpiv.reconstruction.settings import SmartSettings

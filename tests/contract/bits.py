@@ -94,12 +94,6 @@ def started(rig):
     return measured(rig, first=first)
 
 
-def with_motion(rig):
-    """Reconstruct both frames from what they share along the motion."""
-    found = lfpiv.reconstruct_pair(rig.weights, pictures(rig), motion_passes=1, correlation={"windows": (6, 6)})
-    return arrays_of(found)
-
-
 def tracked(rig):
     """Find the particles of both frames and link them."""
     linked = lfpiv.link_particles(*(lfpiv.find_particles(rig.weights, images) for images in pictures(rig)), dt_s=1e-3)
@@ -131,7 +125,6 @@ def cases():
         "cut-off images": functools.partial(cut_off, every["unlike light"]),
         "masked": functools.partial(measured, two, mask=solid(two)),
         "first guess": functools.partial(started, two),
-        "motion": functools.partial(with_motion, two),
         "particles": functools.partial(tracked, two),
         "one pass": functools.partial(correlated, two, windows=6, voxel_mm=0.1),
         "oblong windows": functools.partial(correlated, two, windows=[(8, 12, 10), (4, 8, 6)]),

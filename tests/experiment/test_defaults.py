@@ -6,7 +6,7 @@ import inspect
 import pytest
 
 import lfpiv
-from lfpiv.reconstruction.motion import PairSolver
+from lfpiv.joint.pair import PairSolver
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.settings.processing import Compute, Correlation, Smart, Tracking
 from lfpiv.tracking.finding import ParticleSearch
@@ -24,8 +24,8 @@ def defaults(call):
     [
         (lfpiv.reconstruct, Smart(), set(Smart().of_one_frame())),
         (SmartSettings, Smart(), set(Smart().of_one_frame())),
-        (lfpiv.reconstruct_pair, Smart(), {"iterations", "motion_passes"}),
-        (PairSolver, Smart(), {"motion_passes"}),
+        (lfpiv.reconstruct_pair, Smart(), {"estimate"}),
+        (PairSolver, Smart(), {"estimate"}),
         (lfpiv.correlate, Correlation(), set(Correlation.model_fields)),
         (lfpiv.find_particles, Tracking(), set(Tracking.model_fields)),
         (ParticleSearch, Tracking(), set(Tracking.model_fields)),
@@ -45,5 +45,5 @@ def test_weights_have_the_defaults_of_the_table():
 
 def test_no_setting_of_a_table_is_missing_from_its_call():
     """`measure_pair` has the others, which no single step knows: guard layers, refinement, prediction."""
-    assert set(Smart.model_fields) - set(defaults(lfpiv.reconstruct)) == {"motion_passes", "refinement", "predict"}
+    assert set(Smart.model_fields) - set(defaults(lfpiv.reconstruct)) == {"estimate", "refinement", "predict"}
     assert {field.name for field in dataclasses.fields(CorrelationSettings)} == set(Correlation.model_fields)

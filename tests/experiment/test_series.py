@@ -74,7 +74,11 @@ def test_images_of_pairs_count_through_a_recording(tiny_experiment):
         ("instants = 4", "pairs = 2", "particles: expected first and step only with instants"),
         ("{instant:03d}", "{pair}_{frame}", "expected only {camera}, {instant}"),
         ("_{instant:03d}", "", "expected {instant} in the path"),
-        ("[particles]", "[smart]\nmotion_passes = 1\n[particles]", "smart.motion_passes: expected 0 for a time series"),
+        (
+            "[particles]",
+            '[smart]\nestimate = "joint"\n[particles]',
+            "smart.estimate: expected 'correlation' for a time",
+        ),
     ],
 )
 def test_forms_that_are_no_series_are_refused(tiny_series, old, new, message):

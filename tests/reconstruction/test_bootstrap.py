@@ -96,9 +96,7 @@ def test_pairs_are_spread_evenly():
 @pytest.mark.slow
 def test_the_damping_of_a_rig_is_measured_and_the_same_each_time(weights):
     def measure(frames, noise):
-        volumes = plain_steps.reconstruct_pair(
-            weights, frames, floor=noise, iterations=12, motion_passes=0, sieve_voxel=0.6
-        )
+        volumes = plain_steps.reconstruct_pair(weights, frames, floor=noise, iterations=12, sieve_voxel=0.6)
         return plain_steps.correlate(*volumes, dt_s=1e-3, windows=(12, 8))
 
     particles = RecordedParticles(

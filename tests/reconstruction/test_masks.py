@@ -78,7 +78,7 @@ def test_a_mask_is_given_as_flags_numbers_or_with_coordinates(recorded):
 def test_each_frame_of_a_pair_may_have_its_own_mask(recorded):
     weights, solid, images = recorded
     masks = (solid, np.roll(solid, 1, axis=2))
-    pair = plain_steps.reconstruct_pair(weights, images, iterations=4, mask=masks, motion_passes=0)
+    pair = plain_steps.reconstruct_pair(weights, images, iterations=4, mask=masks)
     for volume, mask, frame in zip(pair, masks, images, strict=True):
         alone = plain_steps.reconstruct(weights, frame, iterations=4, mask=mask)
         np.testing.assert_array_equal(volume["masked"].values, mask)
@@ -88,7 +88,7 @@ def test_each_frame_of_a_pair_may_have_its_own_mask(recorded):
 def test_correlation_reads_the_mask_from_stored_volumes(recorded, tmp_path):
     weights, solid, images = recorded
     options = {"dt_s": 1.0, "windows": (8, 6)}
-    volumes = plain_steps.reconstruct_pair(weights, images, iterations=6, mask=solid, motion_passes=1)
+    volumes = plain_steps.reconstruct_pair(weights, images, iterations=6, mask=solid)
     vectors = plain_steps.correlate(*volumes, **options)
     assert vectors["masked"].values.any() and not vectors["masked"].values.all()
     np.testing.assert_array_equal(vectors["masked"].values, vectors["fluid_share"].values < 0.5)

@@ -300,7 +300,7 @@ def test_images_are_equal_in_every_form_of_file(written, tmp_path, images):
         ("pairs = 2", 'instants = 3\nimages = "{camera}.h5#{instant}"', ".h5#NAME[{instant}]"),
         ("pairs = 2", 'instants = 3\nimages = "../{camera}{instant}.tif"', "below the folder"),
         ("pairs = 2", 'instants = 3\nfirst = 2\nimages = "{camera}.tif#{instant}"', "first = 0 with a stack"),
-        ("[smart]\niterations = 3", "[smart]\nmotion_passes = 1", "smart.motion_passes = 0"),
+        ("[smart]\niterations = 3", '[smart]\nestimate = "joint"', "smart.estimate = 'correlation'"),
     ],
 )
 def test_scenes_that_are_no_series_are_refused(tmp_path, old, new, message):

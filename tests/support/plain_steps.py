@@ -16,8 +16,8 @@ def reconstruct(weights, images, iterations=SMART["iterations"], *args, **settin
 
 
 def reconstruct_pair(weights, images, **settings):
-    """Reconstruct a pair by bare SMART, with a motion pass; settings given count."""
-    return lfpiv.reconstruct_pair(weights, images, **{"motion_passes": 1, **SMART, **settings})
+    """Reconstruct a pair by bare SMART, each frame by itself; settings given count."""
+    return lfpiv.reconstruct_pair(weights, images, **{**SMART, **settings})
 
 
 correlate = functools.partial(lfpiv.correlate, **CORRELATION)

@@ -1,0 +1,107 @@
+"""The joint fit of a pair: rounds of the light and the displacement, started from the frames by themselves.
+
+The light keeps what the displacement was when it was made, so in the first rounds it is made anew. A wrong first
+displacement is forgotten so. Where the fit explains the images much less than the frames by themselves do, particles
+are lost between the frames, and their brightness may differ from there on.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.joint.displacement_steps import DisplacementSteps, Residual
+from lfpiv.joint.light_steps import Light, LightSteps
+from lfpiv.joint.model import JointModel
+from lfpiv.reconstruction.ordered_subsets import Subset
+from lfpiv.reconstruction.result import Reconstruction
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+
+log = logging.getLogger(__name__)
+
+ROUNDS = 5
+"""Largest number of rounds."""
+STARTS = 3
+"""Rounds that begin with light made anew from the frames by themselves."""
+EPOCHS = 2
+"""Epochs over the subsets in a round."""
+RELAXATION = 1.5
+"""Factor of the displacement's steps but those of the last `EXACT` rounds: the light hides a part of each step."""
+EXACT = 2
+"""Last rounds, whose steps are not lengthened."""
+SETTLED_VOXEL = 0.02
+"""Mean change of the displacement below which no other round follows [voxel]."""
+LOST = 1.5
+"""Misfit over that of the frames by themselves above which brightness may differ between the frames."""
+PART = 4
+"""The curvature is that of one subset of the rays in so many."""
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Result of the fit."""
+
+    light: np.ndarray
+    """Light midway in time, shape (z, y, x), float32."""
+    nodes: np.ndarray
+    """Displacement on the nodes of `lfpiv.joint.spline_field.SplineField` [voxel]."""
+    rounds: int
+    misfit_ratio: float
+    """Misfit over that of the frames by themselves."""
+    lossy: bool
+    """Whether brightness may differ between the frames."""
+    residual: Residual
+    """Of the result."""
+
+
+def fit_pair(
+    model: JointModel,
+    found: Sequence[Reconstruction],
+    nodes: np.ndarray,
+    progress: Callable[[float], None] | None = None,
+) -> JointFit:
+    """Fit the light and the displacement of a pair.
+
+    Parameters
+    ----------
+    model : JointModel
+        The model of the frames.
+    found : sequence of two Reconstruction
+        Frames by themselves.
+    nodes : ndarray
+        First displacement [voxel].
+    progress : callable, optional
+        Called with the finished fraction.
+    """
+    steps = LightSteps(model)
+    movement = DisplacementSteps(model, _curvature_rays(steps, len(model.weights.cameras)))
+    alone = sum(one.misfit[-1] for one in found)
+    light, rounds, number = Light(model.start(found, nodes)), ROUNDS, 0
+    while number < rounds:
+        if 0 < number < STARTS:
+            light = Light(model.start(found, nodes))
+        light = steps.epochs(light, model.transports(nodes), EPOCHS)
+        step = movement.step(light.values, nodes, RELAXATION if number < ROUNDS - EXACT else 1.0)
+        nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
+        moved = float(np.abs(model.field.values(step.change)).mean())
+        log.debug("round %d: misfit ratio %.3f, moved by %.3f voxel", number, ratio, moved)
+        if progress is not None:
+            progress(number / (ROUNDS + EXACT))
+        if number == ROUNDS and ratio > LOST and model.sieve_voxel > 0:
+            model.rho = np.zeros_like(model.lit)
+            light, rounds = Light(model.start(found, nodes)), ROUNDS + EXACT
+        elif number >= STARTS and moved < SETTLED_VOXEL and ratio <= LOST:
+            break
+    residual = movement.residual(light.values, model.transports(nodes))
+    return JointFit(light.values, nodes, number, residual.misfit / alone, model.rho is not None, residual)
+
+
+def _curvature_rays(steps: LightSteps, cameras: int) -> Subset:
+    """Return the rays whose curvature stands for that of all: some subsets of all cameras, or every ray."""
+    subsets = steps.partitions[0].subsets
+    if steps.model.frames[0].normalisation.is_joint and len(subsets) >= PART:
+        return Subset(tuple(part for subset in subsets[: len(subsets) // PART] for part in subset.parts))
+    return Subset(tuple((camera, ALL) for camera in range(cameras)))

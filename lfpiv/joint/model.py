@@ -1,0 +1,126 @@
+"""Model of both frames: one volume midway in time, moved half way to each frame, and the light that it loses or gains.
+
+With the light c of voxels midway in time, their displacement d and s = -1, +1 for the two frames, the volume of a frame
+is ``E_f = G' T(s d / 2) c exp(s rho) g_f``. T moves each voxel's light and spreads it as a cubic B-spline
+(`lfpiv_kernels.reconstruction.transport`). G' is the Gaussian that makes the sieve of that spread. g_f is the power of
+the frame's laser. rho is 0 unless particles are lost between the frames: half of the smooth logarithm of the second
+frame's brightness over that of the first one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from lfpiv.joint.spline_field import SplineField
+from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.result import Reconstruction
+from lfpiv.reconstruction.sieve import TRUNCATE, coefficients
+from lfpiv.weights.operator import Weights
+from lfpiv_kernels.filters.blur import GaussianBlur
+from lfpiv_kernels.reconstruction.transport import SPREAD, Transport
+from lfpiv_kernels.transfer import to_device, to_host
+
+LEAST_BLUR_VOXEL = 0.2
+"""Standard deviation below which the rest of the sieve is left out: it hardly blurs [voxel]."""
+SMOOTH_VOXEL = 2.0
+"""Standard deviation of the Gaussian in which brightness may differ between the frames [voxel]: wider than a particle,
+so that a change of brightness cannot stand for a displacement."""
+LEAST_LIGHT = 1e-3
+"""Least light of a voxel that is started from, as a share of the mean of the volume."""
+DARK_SHARE = 0.1
+"""Light added to both volumes before their brightness is compared, as a share of the mean."""
+LARGEST_LOSS = 3.0
+"""Largest absolute rho."""
+SIGNS = (-1, 1)
+"""Direction in which the frames lie in time."""
+
+
+class JointModel:
+    """Volumes of two frames from the light midway in time and its displacement.
+
+    Parameters
+    ----------
+    weights : Weights
+        The operator.
+    frames : sequence of two PreparedInstant
+        Prepared images of both frames.
+    """
+
+    def __init__(self, weights: Weights, frames: Sequence[PreparedInstant]):
+        self.weights, self.frames = weights, tuple(frames)
+        self.field = SplineField(weights.grid)
+        self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel
+        light = [
+            sum(float(one.image.sum(dtype=np.float64)) / one.camera_gain for one in frame.recordings.values())
+            for frame in frames
+        ]
+        self.power = [np.float32(own / math.sqrt(light[0] * light[1])) for own in light]
+        """Power of each frame's laser, relative to the geometric mean of both."""
+        self.rho: np.ndarray | None = None
+        """Half the logarithm of the frames' brightness, shape (z, y, x), float32; None for equally bright frames."""
+        lit = [weights.stored.restore(to_host(frame.normalisation.lit)) > 0 for frame in frames]
+        self.lit = (lit[0] | lit[1]).astype(np.float32)
+        """1 for voxels that a camera sees and that hold fluid in some frame, else 0, shape (z, y, x)."""
+
+    @cached_property
+    def _rest(self) -> GaussianBlur | None:
+        """The part of the sieve that the spline leaves, G'."""
+        sigma = math.sqrt(max(self.sieve_voxel**2 - SPREAD, 0.0))
+        if sigma < LEAST_BLUR_VOXEL:
+            return None
+        return GaussianBlur(sigma, self.weights.grid.shape, truncate=TRUNCATE, border="constant")
+
+    @cached_property
+    def _wide(self) -> GaussianBlur:
+        return GaussianBlur(SMOOTH_VOXEL, self.weights.grid.shape, truncate=TRUNCATE, border="nearest")
+
+    def sieved(self, volume: np.ndarray) -> np.ndarray:
+        """Return G' of a volume (z, y, x): its own adjoint."""
+        return volume if self._rest is None else _blurred(self._rest, volume)
+
+    def smoothed(self, volume: np.ndarray) -> np.ndarray:
+        """Return a volume (z, y, x) blurred by `SMOOTH_VOXEL`."""
+        return _blurred(self._wide, volume)
+
+    def transports(self, nodes: np.ndarray) -> tuple[Transport, Transport]:
+        """Return the transport to each frame."""
+        moved = self.field.values(nodes)
+        first, second = (Transport(moved, sign / 2) for sign in SIGNS)
+        return first, second
+
+    def light_of(self, frame: int, light: np.ndarray) -> np.ndarray:
+        """Return the light midway in time as bright as it is in a frame, shape (z, y, x), float32."""
+        bright: np.ndarray = light * self.power[frame]
+        return bright if self.rho is None else bright * np.exp(SIGNS[frame] * self.rho)
+
+    def volume(self, frame: int, light: np.ndarray, transport: Transport) -> np.ndarray:
+        """Return the volume of a frame, shape (z, y, x), float32."""
+        return self.sieved(transport.push(self.light_of(frame, light)))
+
+    def start(self, found: Sequence[Reconstruction], nodes: np.ndarray) -> np.ndarray:
+        """Return the light midway in time that the volumes of the frames by themselves share, shape (z, y, x), float32.
+
+        It is the geometric mean of both, carried along the displacement. Where brightness may differ, rho is set.
+        """
+        own = [coefficients(one.volume, self.sieve_voxel) for one in found]
+        parts = [
+            transport.pull(volume, self.lit) for transport, volume in zip(self.transports(nodes), own, strict=True)
+        ]
+        least = LEAST_LIGHT * float(np.mean([one.mean(dtype=np.float64) for one in own]))
+        if self.rho is not None:
+            smooth = [self.smoothed(part / power) for part, power in zip(parts, self.power, strict=True)]
+            dark = np.float32(DARK_SHARE * (smooth[0].mean() + smooth[1].mean()))
+            ratio = np.log((smooth[1] + dark) / (smooth[0] + dark))
+            self.rho = np.clip(ratio / 2, -LARGEST_LOSS, LARGEST_LOSS).astype(np.float32)
+        first, second = (np.maximum(part, np.float32(least)) for part in parts)
+        light: np.ndarray = np.sqrt(first * second) * self.lit
+        return light
+
+
+def _blurred(blur: GaussianBlur, volume: np.ndarray) -> np.ndarray:
+    flat = to_device(np.ascontiguousarray(volume, np.float32).reshape(-1), float)
+    return to_host(blur(flat)).reshape(volume.shape)

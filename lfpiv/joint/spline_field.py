@@ -1,0 +1,138 @@
+"""Displacement field on the nodes of a cubic B-spline: values, their adjoint, means over windows, fit to vectors.
+
+Values belong to voxels midway in time. Fields have shape (3, z, y, x), order of components (z, y, x), in voxels of the
+reconstructed grid. All maps are products of one matrix per axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import BSpline
+
+from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.velocity.settings import CorrelationSettings
+
+SPACING_VOXEL = 8.0
+"""Distance of the nodes [voxel]."""
+ROUGH_START = 0.02
+"""Weight of the squared second differences of the nodes in a fit to vectors, each of which has a weight of 1."""
+REPLACED = 0.2
+"""Weight of a vector that validation replaced."""
+STEPS_OF_FIT = 300
+"""Largest number of conjugate gradient steps of a fit to vectors."""
+SMALL = 1e-6
+"""Weight of the squared nodes in a fit to vectors, which makes it unique, and its relative tolerance."""
+
+
+class SplineField:
+    """Nodes of a displacement field over a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+        Voxels midway in time.
+    """
+
+    def __init__(self, grid: Grid):
+        self.grid = grid
+        self._cells = [max(1, round((n - 1) / SPACING_VOXEL)) for n in grid.shape]
+        self.count = tuple(cells + 3 for cells in self._cells)
+        """Nodes along each axis."""
+        self._rough = []
+        for nodes in self.count:
+            second = np.diff(np.eye(nodes), 2, axis=0)
+            self._rough.append(second.T @ second)
+
+    @cached_property
+    def _voxels(self) -> list[np.ndarray]:
+        """Matrix of each axis from nodes to voxels."""
+        return [self._matrix(axis, np.arange(n)) for axis, n in enumerate(self.grid.shape)]
+
+    def _matrix(self, axis: int, places: np.ndarray) -> np.ndarray:
+        """Return the matrix from nodes to places [voxel]; outside the grid the field is constant."""
+        last, cells = self.grid.shape[axis] - 1, self._cells[axis]
+        edge = last / cells if last else 1.0
+        knots = (np.arange(cells + 7) - 3) * edge
+        within = np.clip(places, 0, cells * edge * (1 - 1e-12))
+        matrix: np.ndarray = BSpline.design_matrix(within, knots, 3).toarray()
+        return matrix
+
+    def values(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the displacement of each voxel, shape (3, z, y, x), float32."""
+        return np.ascontiguousarray(_along_axes(self._voxels, nodes), dtype=np.float32)
+
+    def adjoint(self, values: np.ndarray) -> np.ndarray:
+        """Return the adjoint of `values`, shape of the nodes."""
+        return _along_axes([matrix.T for matrix in self._voxels], values.astype(np.float64))
+
+    def values_on(self, nodes: np.ndarray, grid: Grid) -> np.ndarray:
+        """Return the displacement at the voxels of another grid [voxel of that grid], shape (3, z, y, x), float32."""
+        own, matrices = self.grid, []
+        for axis in range(3):
+            places = (grid.axis_mm(axis) - own.first_centre_mm[axis]) / own.voxel_mm
+            matrices.append(self._matrix(axis, places))
+        found: np.ndarray = (_along_axes(matrices, nodes) * (own.voxel_mm / grid.voxel_mm)).astype(np.float32)
+        return found
+
+    def penalty(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the gradient of half the sum of the squared second differences along each axis."""
+        z, y, x = self._rough
+        total: np.ndarray = np.einsum("ab,ibcd->iacd", z, nodes)
+        total = total + np.einsum("bc,iacd->iabd", y, nodes) + np.einsum("cd,iabd->iabc", x, nodes)
+        return total
+
+    def fitted_to(self, vectors: xr.Dataset) -> np.ndarray:
+        """Return smooth nodes whose means over the windows are the vectors, so that windows do not damp the field.
+
+        Vectors that were replaced count little, masked ones not at all.
+        """
+        edges = np.asarray(vectors.attrs["voxel_mm"], float)
+        window = CorrelationSettings.of(vectors).windows[-1]
+        means = []
+        for axis, name in enumerate(AXES):
+            share = window_shares(self.grid.axes_mm[axis], vectors[name].values, window[axis] * edges[axis])
+            means.append(share @ self._voxels[axis])
+        scale = (edges / self.grid.voxel_mm)[:, None, None, None]
+        given = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES]).astype(float) * scale
+        weight = np.where(vectors["valid"].values, 1.0, REPLACED) * np.isfinite(given).all(0)
+        given = np.where(weight > 0, given, 0.0)
+        back = [matrix.T for matrix in means]
+
+        def normal(nodes: np.ndarray) -> np.ndarray:
+            fitted = _along_axes(back, weight * _along_axes(means, nodes))
+            total: np.ndarray = fitted + ROUGH_START * self.penalty(nodes) + SMALL * nodes
+            return total
+
+        rest = _along_axes(back, weight * given)
+        nodes, way, square = np.zeros_like(rest), rest.copy(), float((rest**2).sum())
+        least = SMALL**2 * square
+        for _ in range(STEPS_OF_FIT):
+            if square <= least:
+                break
+            image = normal(way)
+            length = square / float((way * image).sum())
+            nodes += length * way
+            rest -= length * image
+            square, before = float((rest**2).sum()), square
+            way = rest + (square / before) * way
+        return nodes
+
+
+def window_shares(voxels_mm: np.ndarray, centres_mm: np.ndarray, edge_mm: float) -> np.ndarray:
+    """Return the matrix from values of voxels along an axis to their means over windows, shape (window, voxel)."""
+    voxel_mm = (voxels_mm[-1] - voxels_mm[0]) / (len(voxels_mm) - 1) if len(voxels_mm) > 1 else edge_mm
+    reach = (edge_mm + voxel_mm) / 2 - np.abs(voxels_mm - np.asarray(centres_mm)[:, None])
+    share = np.clip(reach / voxel_mm, 0, 1)
+    mean: np.ndarray = share / share.sum(axis=1, keepdims=True)
+    return mean
+
+
+def _along_axes(matrices: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
+    """Apply a matrix along each of the last three axes of values, shape (3, z, y, x)."""
+    for axis, matrix in enumerate(matrices, start=1):
+        values = np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+    return values

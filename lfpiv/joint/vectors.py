@@ -1,0 +1,164 @@
+"""Vectors of a joint fit: means of its displacement over the windows, where the frames by themselves agree.
+
+A joint fit can believe itself: volumes that share their light move against each other as they were made. So the volumes
+of each frame by itself are deformed onto each other by the displacement and correlated once more. Where they still move
+by more than their uncertainty, the vector of their own correlation stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lfpiv.geometry.grid import AXES
+from lfpiv.joint.pair import MOVED, UNSHARED, Estimate
+from lfpiv.joint.spline_field import window_shares
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
+from lfpiv.velocity.peak_width import peak_reach, refine_search
+from lfpiv.velocity.predictor import CONTROL_SPACING, Predictor
+from lfpiv.velocity.settings import CorrelationSettings, triple
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess, solid_voxels, voxel_axes
+from lfpiv.velocity.windows import Windows
+from lfpiv_kernels.correlation.correlate import correlate_windows
+from lfpiv_kernels.correlation.uncertainty import displacement_deviation
+
+CONTRADICTION = 8.0
+"""Displacement that is left between the frames by themselves, over the median of its standard deviation, above which
+they contradict. Ghosts leave some, up to 6 in sound pairs."""
+FARTHEST_VOXEL = 0.5
+"""Displacement that is left above which they contradict in any case [voxel]."""
+
+
+def is_joint(*volumes: xr.DataArray) -> bool:
+    """Return whether volumes are those of a joint fit."""
+    has_field = all(name in volumes[0].coords for name in MOVED.values())
+    return has_field and all(UNSHARED in volume.coords for volume in volumes)
+
+
+def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None, **correlation: Any) -> xr.Dataset:
+    """Return the vectors of a joint fit.
+
+    Parameters
+    ----------
+    volumes : sequence of two DataArrays, shape (z, y, x)
+        From `reconstruct_pair` with ``estimate="joint"``; of others the vectors of `correlate` are returned.
+    dt_s : float, optional
+        Time between the frames [s].
+    **correlation
+        Settings of `correlate`.
+
+    Returns
+    -------
+    Dataset
+        As `correlate` returns it. ``joint`` is true where the vector is the mean of the fitted displacement over the
+        window, false where the frames by themselves contradict it and the vector is that of their correlation.
+        ``valid`` is that of their correlation. ``correlation`` and ``peak_ratio`` are those of the frames by
+        themselves, deformed by the fitted displacement.
+
+    Raises
+    ------
+    ValueError
+        As `correlate`.
+    """
+    about = {
+        name: volumes[0].attrs[name] for name in ("estimate", "rounds", "misfit_ratio") if name in volumes[0].attrs
+    }
+    if about.get("estimate") == Estimate.ALONE.value:
+        del about["estimate"]
+    if not is_joint(*volumes):
+        return correlate(*volumes, dt_s=dt_s, **correlation).assign_attrs(about)
+    alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
+    vectors = correlate(*alone, dt_s=dt_s, **correlation)
+    return _merged(vectors, compare(vectors, volumes, alone)).assign_attrs(about)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the frames by themselves say about a fitted displacement, of each vector; shapes (z, y, x, 3) [voxel]."""
+
+    fitted: np.ndarray
+    """Mean of the fitted displacement over the window."""
+    left: np.ndarray
+    """Displacement that is left between the frames by themselves."""
+    scatter: np.ndarray
+    """Standard deviation of `left`, from the correlation statistics."""
+    correlation: np.ndarray
+    """Coefficient, shape (z, y, x)."""
+    peak_ratio: np.ndarray
+
+    def agrees(self, valid: np.ndarray) -> np.ndarray:
+        """Return whether nothing is left beyond its typical uncertainty in valid vectors, shape (z, y, x)."""
+        typical = np.nanmedian(self.scatter[valid], axis=0) if valid.any() else np.zeros(3)
+        found: np.ndarray = (np.abs(self.left) <= np.minimum(CONTRADICTION * typical, FARTHEST_VOXEL)).all(-1)
+        return found
+
+
+def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequence[xr.DataArray]) -> Evidence:
+    """Deform the frames by themselves onto each other by the fitted displacement, and correlate them once more."""
+    settings = CorrelationSettings.of(vectors)
+    window, edges = settings.windows[-1], np.asarray(vectors.attrs["voxel_mm"], float)
+    moved = np.stack([volumes[0][MOVED[axis]].values for axis in AXES], -1)
+    fitted = moved.astype(float)
+    for axis, name in enumerate(AXES):
+        share = window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
+        fitted = np.moveaxis(np.tensordot(share, fitted, (1, axis)), 0, axis)
+    missing = missing_smoothing(settings.smoothing_voxel, *alone)
+    first, second = (
+        preprocess((one.values - np.median(one.values)).astype(np.float32), missing, settings.intensity_power)
+        for one in alone
+    )
+    shape = triple(first.shape)
+    solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
+    (first, second), _ = UndeformedPair((first, second), solid).deformed(_predictor(moved), window)
+    step = triple(
+        round((at[1] - at[0]) / edge) if len(at) > 1 else n
+        for at, edge, n in zip((vectors[name].values for name in AXES), edges, shape, strict=True)
+    )
+    windows = Windows.covering(shape, window, step)
+    scatter = displacement_deviation(
+        first, second, window=window, origin=windows.origin, step=step, count=windows.count
+    )
+    reach = peak_reach(first, second, window)
+    left = correlate_windows(
+        first, second, window=window, step=step, search=refine_search(reach), symmetric=True, reach=reach
+    )
+    return Evidence(
+        fitted=fitted,
+        left=left.displacement,
+        scatter=scatter,
+        correlation=left.correlation,
+        peak_ratio=peak_ratio(left),
+    )
+
+
+def _predictor(moved: np.ndarray) -> Predictor:
+    """Return a displacement (z, y, x, 3) on the control points of a deformation."""
+    places = [np.unique(np.r_[np.arange(0, n, CONTROL_SPACING), n - 1]) for n in moved.shape[:3]]
+    return Predictor.between(places, moved[np.ix_(*places)].astype(float), triple(moved.shape[:3]))
+
+
+def _merged(vectors: xr.Dataset, evidence: Evidence) -> xr.Dataset:
+    """Return the vectors with the fitted displacement where the frames agree with it."""
+    valid = vectors["valid"].values
+    own = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], -1)
+    joint = evidence.agrees(valid) & np.isfinite(own).all(-1)
+    displacement = np.where(joint[..., None], evidence.fitted, own)
+    changed: dict[str, np.ndarray] = {}
+    for k, axis in enumerate(AXES):
+        changed[f"displacement_{axis}"] = displacement[..., k]
+    if "dt_s" in vectors.attrs:
+        metres = np.asarray(vectors.attrs["voxel_mm"]) * 1e-3 / vectors.attrs["dt_s"]
+        for name, k in zip("uvw", (2, 1, 0), strict=True):
+            changed[name] = displacement[..., k] * metres[k]
+    changed["correlation"] = np.where(joint, evidence.correlation, vectors["correlation"].values)
+    changed["peak_ratio"] = np.where(joint, evidence.peak_ratio, vectors["peak_ratio"].values)
+    found = {name: vectors[name].copy(data=values.astype(np.float32)) for name, values in changed.items()}
+    about = {"long_name": "mean of the fitted displacement; false: contradicted, and measured by correlation"}
+    found["joint"] = xr.DataArray(joint, vectors["valid"].coords, vectors["valid"].dims, attrs=about)
+    share = float(joint[valid].mean()) if valid.any() else 0.0
+    return vectors.assign(found).assign_attrs(joint_fraction=share)
