@@ -52,7 +52,7 @@ class Choice:
     floor: float | None = None
     flat_guess: bool = False
     both_frames: bool = False
-    """Both frames are reconstructed at once, by motion passes."""
+    """Both frames are reconstructed at once, by a joint fit."""
 
     @property
     def reconstructs(self) -> bool:
@@ -216,7 +216,7 @@ def _result(
 
 
 def _both_frames(own: Bench, name: str, smart: Smart) -> tuple[list[xr.DataArray], dict[str, float]]:
-    """Reconstruct the usual pair by motion passes, or read it from the folder."""
+    """Reconstruct the usual pair by a joint fit, or read it from the folder."""
     settings = {
         "seed": own.seed,
         "size_mm": own.size_mm,
