@@ -8,9 +8,9 @@ import pytest
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import NO_LAYERS
 from lfpiv.reconstruction.beyond import FaceLight
-from lfpiv.results import netcdf, provenance, stamps
+from lfpiv.results import provenance, stamps
 from lfpiv.results.folder import Folder
-from lfpiv.runs import guard, memory, pipeline
+from lfpiv.runs import guard, memory
 from lfpiv.runs.guard import Guard
 from lfpiv.warn import Code
 
@@ -60,20 +60,3 @@ def test_estimates_of_memory_count_the_guard_layers(experiment):
     assert padded.grid.shape[0] == experiment.grid.shape[0] + 12
     assert memory.worker_bytes(padded) > memory.worker_bytes(experiment)
     assert memory.weights_bytes(padded) > memory.weights_bytes(experiment)
-
-
-@pytest.mark.slow
-def test_the_volumes_are_those_of_the_experiment(small_run, tmp_path):
-    file = small_run.images(tmp_path / "data")
-    text = file.read_text()
-    file.write_text(text.replace("[volume]", "[volume]\nguard_mm = [0.0, 0.1, 0.2]"))
-    out = small_run.calibrated(tmp_path / "out")
-    summary = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
-    assert summary["guard"]["thickness_mm"] == [[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]
-    assert summary["weights"]["memory_mib"] > small_run.summary["weights"]["memory_mib"]
-    volume = netcdf.read_volume(out / "volumes" / "pair_0000_a.nc")
-    experiment = read_experiment(file)
-    assert volume.shape == experiment.grid.shape
-    assert volume.z.values[0] == pytest.approx(experiment.grid.axis_mm(0)[0])
-    again = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
-    assert "vectors of pair 0" in again["reused"]

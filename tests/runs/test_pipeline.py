@@ -103,18 +103,6 @@ def test_the_report_tells_of_this_run(finished):
 
 
 @pytest.mark.slow
-def test_a_second_run_does_nothing_anew(finished):
-    experiment, out, first = finished
-    written = {path: path.stat().st_mtime_ns for path in out.rglob("*.[hn][5c]")}
-    second = pipeline.run(experiment, out, keep_volumes=True)
-    assert second["reused"] == ["calibration", *(f"vectors of pair {pair}" for pair in range(PAIRS))]
-    assert {path: path.stat().st_mtime_ns for path in written} == written
-    for stage in STAGES[:-1]:
-        assert second["timings_s"][stage] == pytest.approx(first["timings_s"][stage]), stage
-    assert second["pairs"] == first["pairs"] and second["timings_s"]["total"] < first["timings_s"]["total"]
-
-
-@pytest.mark.slow
 def test_steps_one_at_a_time_give_the_same(finished):
     experiment, out, _ = finished
     path = out / "vectors" / "pair_0001.nc"

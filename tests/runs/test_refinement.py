@@ -77,16 +77,21 @@ def test_finer_voxels_are_solid_where_their_centres_are(experiment):
 
 
 @pytest.mark.slow
-def test_volumes_are_written_on_the_voxels_of_the_experiment(small_run, tmp_path):
+def test_volumes_are_written_on_the_voxels_of_the_experiment_without_guard_layers(small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
     text = file.read_text()
     assert "[smart]\n" in text
+    text = text.replace("[volume]", "[volume]\nguard_mm = [0.0, 0.1, 0.2]")
     file.write_text(text.replace("[smart]\n", "[smart]\nrefinement = 1.25\nsieve_voxel = 0.6\n"))
     out, experiment = small_run.calibrated(tmp_path / "out"), read_experiment(file)
     summary = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
+    assert summary["guard"]["thickness_mm"] == [[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]]
+    assert summary["weights"]["memory_mib"] > small_run.summary["weights"]["memory_mib"]
     assert summary["refinement"]["factor"] == 1.25 and not (out / "refinement.json").exists()
     volume = netcdf.read_volume(out / "volumes" / "pair_0000_a.nc", grid=experiment.grid)
-    assert volume.shape == experiment.grid.shape and volume.attrs["sieve_voxel"] == pytest.approx(0.6)
+    assert volume.shape == experiment.grid.shape
+    assert volume.z.values[0] == pytest.approx(experiment.grid.axis_mm(0)[0])
+    assert volume.attrs["sieve_voxel"] == pytest.approx(0.6)
     assert volume.attrs["reconstruction_voxel_mm"] == pytest.approx(experiment.grid.voxel_mm / 1.25)
     assert "vectors of pair 0" in pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)["reused"]
     file.write_text(text.replace("[smart]\n", "[smart]\nrefinement = 1.5\nsieve_voxel = 0.6\n"))
