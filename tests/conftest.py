@@ -149,7 +149,7 @@ def reported(tmp_path_factory, device):
     """Return a small finished run, and its report under `page`."""
     from support.report_run import make_run
 
-    return make_run(tmp_path_factory.mktemp("reported"))
+    return made_once(tmp_path_factory, "reported", make_run)
 
 
 @pytest.fixture(scope="session")
