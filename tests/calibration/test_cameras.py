@@ -96,18 +96,6 @@ def test_a_calibration_read_back_is_the_same(rig, tmp_path):
     assert again.decoder.background(image) == camera.decoder.background(image)
 
 
-def test_a_network_that_was_shrunk_to_nothing_is_read_back(rig, tmp_path):
-    """It helped on no held-out ray, so that its correction is multiplied by 0."""
-    _, _, calibration = rig
-    camera = calibration.cameras["only"]
-    bare = dataclasses.replace(camera, network=camera.network.with_scaled_output(0.0))
-    dataclasses.replace(calibration, cameras={"only": bare}).save(tmp_path / "calibration.h5")
-    again = lfpiv.load_calibration(tmp_path / "calibration.h5").cameras["only"]
-    points, pupil = rays_in([-1, -1, -1], [1, 1, 1], count=100)
-    assert np.abs(again.map(points, pupil) - bare.map(points, pupil)).max() <= ROUND_TRIP_MM
-    assert not again.network(np.concatenate([points, pupil], axis=1)).any()
-
-
 def test_a_fan_of_rays_is_the_mapping(rig):
     _, _, calibration = rig
     camera = calibration.cameras["only"]
@@ -229,7 +217,7 @@ def test_a_flip_that_nothing_shows_is_asked_for(rig):
         assert [warning.code for warning in warnings] == codes
 
 
-@pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4), (5, 3), (30, 30)])
+@pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4)])
 def test_a_board_stated_larger_or_smaller_than_it_is_is_refused(rig, stated):
     """An even number for an odd one shifts all dots by half a spacing, and no other check finds it."""
     experiment, _, _ = rig
