@@ -91,25 +91,6 @@ def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path):
     assert len(summary["pairs"]) == PAIRS and summary["failed"] == []
 
 
-@pytest.mark.slow
-def test_a_killed_worker_costs_nothing_and_a_bad_pair_only_itself(small_run, tmp_path):
-    """One of two workers dies by kill -9, one image is damaged: the other pairs are done, status 3, as documented."""
-    experiment, out = small_run.images(tmp_path / "data"), small_run.prepared(tmp_path / "out")
-    spoilt = next((tmp_path / "data").rglob("*0002*"))
-    damage(spoilt)
-    run = start("run", experiment, "--out", out, "--workers", 2)
-    wait_for(lambda: workers_of(run), run, "worker")[0].kill()
-    written, said = run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 3, said
-    summary = json.loads((out / "summary.json").read_text())
-    assert [pair["pair"] for pair in summary["pairs"]] == [0, 1, 3] and summary["workers"]["count"] == 2
-    ((failed),) = summary["failed"]
-    assert failed["pair"] == 2 and spoilt.name in failed["reason"] and "damaged" in failed["reason"]
-    assert "failed: pair 2:" in written and "its worker died; it is tried once more" in said and whole(out)
-    (reference := small_run.results(tmp_path / "reference")).joinpath("vectors", "pair_0002.nc").unlink()
-    assert same_vectors(reference, out) == PAIRS - 1
-
-
 def dask(*arguments):
     """Start a part of a cluster as a user does, and in its own group, which ends it as a whole."""
     command = [sys.executable, "-m", "dask", *map(str, arguments), "--no-dashboard", "--host", "127.0.0.1"]
@@ -158,44 +139,6 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
     assert run.returncode == 0, said
     assert same_vectors(small_run.out, out) == PAIRS and whole(out)
     assert worker.poll() is None and scheduler.poll() is None, "the cluster is not ours to end"
-
-
-def suspended(worker, out):
-    """Suspend a worker and its children, not while they write a file; return them."""
-    processes = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
-    while True:
-        for process in processes:
-            process.suspend()
-        if not list(out.rglob("*.tmp")):
-            return processes
-        for process in processes:
-            process.resume()
-        time.sleep(0.01)
-
-
-@pytest.mark.slow
-def test_a_lost_scheduler_ends_the_run_with_one_message(small_run, tmp_path, cluster):
-    """Kill -9: status 1, all files whole, and the same command goes on, here without the cluster.
-
-    The worker is suspended meanwhile: it would finish its pairs however late the run sees that the scheduler is gone.
-    """
-    address, scheduler, start_worker = cluster
-    out, worker = small_run.prepared(tmp_path / "out"), start_worker()
-    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
-    wait_for(lambda: finished(out), run, "finished pair")
-    idle = suspended(worker, out)
-    scheduler.kill()
-    _, said = run.communicate(timeout=PATIENCE_S)
-    last = said.splitlines()[-1]
-    assert run.returncode == 1 and f"the scheduler at {address} is gone" in last and "the same command goes on" in last
-    assert "Traceback" not in said and whole(out)
-    before = finished(out)
-    assert 0 < len(before) < PAIRS
-    pipeline.run(small_run.experiment, out)
-    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
-    for process in idle:
-        process.resume()
-    worker.wait(PATIENCE_S)
 
 
 SBATCH = """#!/bin/sh

@@ -197,12 +197,12 @@ def test_run_tells_that_a_camera_moved_and_corrects_it_where_asked(
     assert np.allclose(corrected.cameras["right"].map(points, pupil), expected.map(points, pupil), atol=0.01)
 
     monkeypatch.undo()
-    again = pipeline.run(file, out, pairs=(0, 2))
+    again = pipeline.run(file, out, pairs=(0, 1))
     assert "vectors of pair 0" in again["reused"] and again["weights"]["self_calibration"] == figures
     assert "Cameras against each other" in (out / "report.html").read_text("utf-8")
     for path in (file.parent / "particles").glob("*/*"):
         path.unlink()
-    assert [pair["pair"] for pair in pipeline.report(file, out)["pairs"]] == [0, 1]  # results outlive their images
+    assert [pair["pair"] for pair in pipeline.report(file, out)["pairs"]] == [0]  # results outlive their images
 
 
 def small_grid(file):
