@@ -105,6 +105,7 @@ def test_damaged_results_are_named(run, tmp_path):
     assert "Traceback" not in found.errors
 
 
+@pytest.mark.slow
 def test_interrupt_ends_a_run_at_once(run, tmp_path):
     process = start("-m", "lfpiv", "run", run.experiment, "--out", tmp_path / "out")
     assert "kernels run on" in process.stderr.readline()
