@@ -22,7 +22,7 @@ from lfpiv_kernels.reconstruction.transport import Transport
 
 ROUGH = 0.3
 """Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel."""
-STEPS = 4
+STEPS = 6
 """Conjugate gradient steps."""
 SMALL_REST = 1e-3
 """Share of the first residual below which conjugate gradients end."""

@@ -34,9 +34,10 @@ EXACT = 2
 """Last rounds, whose steps are not lengthened."""
 SETTLED_VOXEL = 0.02
 """Mean change of the displacement below which no other round follows [voxel]."""
-LOST = 1.5
-"""Misfit over that of the frames by themselves above which brightness may differ between the frames."""
-PART = 4
+LOST, JUDGED = 2.5, 2
+"""Misfit over that of the frames by themselves, after so many rounds, above which particles are lost between frames.
+The fit then begins again with brightness that may differ."""
+PART = 2
 """The curvature is that of one subset of the rays in so many."""
 
 
@@ -79,24 +80,24 @@ def fit_pair(
     steps = LightSteps(model)
     movement = DisplacementSteps(model, _curvature_rays(steps, len(model.weights.cameras)))
     alone = sum(one.misfit[-1] for one in found)
-    light, rounds, number = Light(model.start(found, nodes)), ROUNDS, 0
-    while number < rounds:
-        if 0 < number < STARTS:
+    first, number, done, light = nodes, 0, 0, Light(model.lit)
+    while number < ROUNDS:
+        if number < STARTS:
             light = Light(model.start(found, nodes))
         light = steps.epochs(light, model.transports(nodes), EPOCHS)
         step = movement.step(light.values, nodes, RELAXATION if number < ROUNDS - EXACT else 1.0)
         nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
+        done += 1
         moved = float(np.abs(model.field.values(step.change)).mean())
         log.debug("round %d: misfit ratio %.3f, moved by %.3f voxel", number, ratio, moved)
         if progress is not None:
-            progress(number / (ROUNDS + EXACT))
-        if number == ROUNDS and ratio > LOST and model.sieve_voxel > 0:
-            model.rho = np.zeros_like(model.lit)
-            light, rounds = Light(model.start(found, nodes)), ROUNDS + EXACT
-        elif number >= STARTS and moved < SETTLED_VOXEL and ratio <= LOST:
+            progress(done / (ROUNDS + JUDGED))
+        if number == JUDGED and ratio > LOST and model.sieve_voxel > 0 and model.rho is None:
+            model.rho, nodes, number = np.zeros_like(model.lit), first, 0
+        if number >= STARTS and moved < SETTLED_VOXEL:
             break
     residual = movement.residual(light.values, model.transports(nodes))
-    return JointFit(light.values, nodes, number, residual.misfit / alone, model.rho is not None, residual)
+    return JointFit(light.values, nodes, done, residual.misfit / alone, model.rho is not None, residual)
 
 
 def _curvature_rays(steps: LightSteps, cameras: int) -> Subset:

@@ -72,7 +72,8 @@ class PairResult:
             if self.fit is not None:
                 about = {"units": "counts", "long_name": "particle intensity, this frame by itself"}
                 volume = volume.assign_coords({UNSHARED: (volume.dims, before.volume, about)})
-                volume.attrs |= {"rounds": self.fit.rounds, "misfit_ratio": round(self.fit.misfit_ratio, 4)}
+                ratio = round(self.fit.misfit_ratio, 4)
+                volume.attrs |= {"rounds": self.fit.rounds, "misfit_ratio": ratio, "lossy": int(self.fit.lossy)}
             volumes.append(volume if grid is None else volume_on(volume, grid))
         first, second = volumes
         if self.fit is not None and self.model is not None:
@@ -184,8 +185,8 @@ class PairSolver:
             seen = weights.stored.restore(to_host(prepared[number].normalisation.lit)) > 0
             volume = np.where(seen, volume, np.float32(0)).astype(np.float32)
             residual, misfit = fit.residual.of_frame[number]
-            history = {"residual": (*own.residual, residual), "misfit": (*own.misfit, misfit)}
-            frames.append(replace(own, volume=volume, **history))
+            residuals, misfits = (*own.residual, residual), (*own.misfit, misfit)
+            frames.append(replace(own, volume=volume, residual=residuals, misfit=misfits))
         return PairResult(
             frames=(frames[0], frames[1]), unshared=alone.frames, estimate=Estimate.JOINT, model=model, fit=fit
         )
@@ -235,10 +236,10 @@ def reconstruct_pair(
     -------
     list of two DataArrays, shape (z, y, x), float32
         Volumes as `reconstruct` returns them, with the attribute `estimate`: how they were made. After a joint fit the
-        attributes `rounds` and `misfit_ratio` state its rounds and its misfit over that of the frames by themselves,
-        the last of `residual` and `misfit` are those of the fit, the coordinate `UNSHARED` is the volume of the frame
-        by itself, and the coordinates `MOVED` of the first volume are the displacement. `joint_vectors` makes vectors
-        of them.
+        attributes `rounds`, `misfit_ratio` and `lossy` state its rounds, its misfit over that of the frames by
+        themselves, and whether brightness differs between the frames, since particles are lost between them. The last
+        of `residual` and `misfit` are those of the fit, the coordinate `UNSHARED` is the volume of the frame by itself,
+        and the coordinates `MOVED` of the first volume are the displacement. `joint_vectors` makes vectors of them.
 
     Raises
     ------

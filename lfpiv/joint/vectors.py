@@ -3,6 +3,10 @@
 A joint fit can believe itself: volumes that share their light move against each other as they were made. So the volumes
 of each frame by itself are deformed onto each other by the displacement and correlated once more. Where they still move
 by more than their uncertainty, the vector of their own correlation stays.
+
+The curvature of the misfit is no measure of the error of the fit, since the light was fitted to the same images. The
+uncertainty of the frames by themselves is independent of the fit, which halves it. In simulated pairs twice the
+standard deviation stated holds 92 to 100 % of the errors of a component (docs/notebook/joint.md).
 """
 
 from __future__ import annotations
@@ -30,8 +34,15 @@ from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 CONTRADICTION = 8.0
 """Displacement that is left between the frames by themselves, over the median of its standard deviation, above which
 they contradict. Ghosts leave some, up to 6 in sound pairs."""
+ALONE_SHARE, LEFT_SHARE, LOSSY = 0.45, 0.3, 2.0
+"""Standard deviation of a fitted vector: parts that the uncertainty of the frames by themselves and the displacement
+that is left between them add in squares, and the factor of both where particles are lost between the frames."""
 FARTHEST_VOXEL = 0.5
 """Displacement that is left above which they contradict in any case [voxel]."""
+
+
+ATTRIBUTES = ("estimate", "rounds", "misfit_ratio", "lossy")
+"""Attributes of volumes that their vectors have, too."""
 
 
 def is_joint(*volumes: xr.DataArray) -> bool:
@@ -57,6 +68,8 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     Dataset
         As `correlate` returns it. ``joint`` is true where the vector is the mean of the fitted displacement over the
         window, false where the frames by themselves contradict it and the vector is that of their correlation.
+        ``uncertainty_z``, ``_y``, ``_x`` of the former ones are those of the frames by themselves, lowered as the fit
+        lowers the error, and what is left between these frames.
         ``valid`` is that of their correlation. ``correlation`` and ``peak_ratio`` are those of the frames by
         themselves, deformed by the fitted displacement.
 
@@ -65,16 +78,15 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     ValueError
         As `correlate`.
     """
-    about = {
-        name: volumes[0].attrs[name] for name in ("estimate", "rounds", "misfit_ratio") if name in volumes[0].attrs
-    }
+    about = {name: volumes[0].attrs[name] for name in ATTRIBUTES if name in volumes[0].attrs}
     if about.get("estimate") == Estimate.ALONE.value:
         del about["estimate"]
     if not is_joint(*volumes):
         return correlate(*volumes, dt_s=dt_s, **correlation).assign_attrs(about)
     alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
     vectors = correlate(*alone, dt_s=dt_s, **correlation)
-    return _merged(vectors, compare(vectors, volumes, alone)).assign_attrs(about)
+    lossy = LOSSY if about.get("lossy") else 1.0
+    return _merged(vectors, compare(vectors, volumes, alone), lossy).assign_attrs(about)
 
 
 @dataclass(frozen=True)
@@ -142,7 +154,7 @@ def _predictor(moved: np.ndarray) -> Predictor:
     return Predictor.between(places, moved[np.ix_(*places)].astype(float), triple(moved.shape[:3]))
 
 
-def _merged(vectors: xr.Dataset, evidence: Evidence) -> xr.Dataset:
+def _merged(vectors: xr.Dataset, evidence: Evidence, factor: float = 1.0) -> xr.Dataset:
     """Return the vectors with the fitted displacement where the frames agree with it."""
     valid = vectors["valid"].values
     own = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], -1)
@@ -155,6 +167,12 @@ def _merged(vectors: xr.Dataset, evidence: Evidence) -> xr.Dataset:
         metres = np.asarray(vectors.attrs["voxel_mm"]) * 1e-3 / vectors.attrs["dt_s"]
         for name, k in zip("uvw", (2, 1, 0), strict=True):
             changed[name] = displacement[..., k] * metres[k]
+    stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
+    fitted = factor * np.sqrt((ALONE_SHARE * stated) ** 2 + (LEFT_SHARE * evidence.left) ** 2)
+    deviation = np.where(joint[..., None], fitted, stated)
+    for k, axis in enumerate(AXES):
+        changed[f"uncertainty_{axis}"] = deviation[..., k]
+    changed["uncertainty"] = np.sqrt((deviation**2).sum(-1))
     changed["correlation"] = np.where(joint, evidence.correlation, vectors["correlation"].values)
     changed["peak_ratio"] = np.where(joint, evidence.peak_ratio, vectors["peak_ratio"].values)
     found = {name: vectors[name].copy(data=values.astype(np.float32)) for name, values in changed.items()}

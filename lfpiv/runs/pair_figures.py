@@ -48,6 +48,8 @@ class JointFigures:
     rounds: int = 0
     misfit_ratio: float = 1.0
     """Misfit over that of the frames by themselves."""
+    lossy: bool = False
+    """Whether brightness differs between the frames, since particles are lost between them."""
     share: float = 0.0
     """Share of the valid vectors that are means of the fitted displacement; the others are those of the correlation."""
 
@@ -202,6 +204,7 @@ def _joint(attributes: Mapping[str, Any]) -> JointFigures:
         fitted=True,
         rounds=int(attributes["rounds"]),
         misfit_ratio=float(attributes["misfit_ratio"]),
+        lossy=bool(attributes["lossy"]),
         share=float(attributes["joint_fraction"]),
     )
 
