@@ -67,6 +67,7 @@ def test_summary_and_report(run):
     assert "<svg" in (run.out / "report.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_a_finished_run_repeats_nothing(run, tmp_path):
     out = shutil.copytree(run.out, tmp_path / "out")
     before = {path: path.stat().st_mtime_ns for path in sorted(out.rglob("*.nc"))}

@@ -92,6 +92,7 @@ def test_one_camera_cannot_be_checked_and_that_is_said(rig):
     assert "one camera" in found.sentence and not found.refusals
 
 
+@pytest.mark.slow
 def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_path, caplog):
     file = small_run.images(tmp_path / "data")
     for path in (file.parent / "particles" / "left").iterdir():
@@ -104,6 +105,7 @@ def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_pa
     assert 12 < float(said.split(" have ")[1].split()[0]) < 20  # the cameras are not equally bright
 
 
+@pytest.mark.slow
 def test_a_pair_whose_frames_are_exchanged_in_one_camera_is_refused(small_run, tmp_path, empty_report):
     file = small_run.images(tmp_path / "data")
     left = sorted((file.parent / "particles" / "left").iterdir())
