@@ -149,6 +149,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow(but="angle")
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
     experiment, _, calibration = rig
@@ -217,6 +218,7 @@ def test_a_flip_that_nothing_shows_is_asked_for(rig):
         assert [warning.code for warning in warnings] == codes
 
 
+@pytest.mark.slow(but="stated0")
 @pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4)])
 def test_a_board_stated_larger_or_smaller_than_it_is_is_refused(rig, stated):
     """An even number for an odd one shifts all dots by half a spacing, and no other check finds it."""

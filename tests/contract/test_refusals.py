@@ -1,5 +1,6 @@
 """Wrong input ends by one message that names it, without a traceback, before any file is written."""
 
+import functools
 import os
 import shutil
 import signal
@@ -105,9 +106,9 @@ def test_damaged_results_are_named(run, tmp_path):
     assert "Traceback" not in found.errors
 
 
-@pytest.mark.slow
 def test_interrupt_ends_a_run_at_once(run, tmp_path):
-    process = start("-m", "lfpiv", "run", run.experiment, "--out", tmp_path / "out")
+    default = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # jobs in the background ignore it
+    process = start("-m", "lfpiv", "run", run.experiment, "--out", tmp_path / "out", preexec_fn=default)
     assert "kernels run on" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     found = finish(process)

@@ -52,6 +52,7 @@ def projector(request, device):
     return weights.projector(next(iter(weights.cameras)))
 
 
+@pytest.mark.slow(but="pixels")
 @pytest.mark.parametrize("sampled", [(), SAMPLED])
 def test_a_traced_gather_reads_the_rays_of_its_blocks(projector, sampled):
     """The rule, by NumPy: lane l reads column l % 8 of rows l // 8, l // 8 + 4, ... of each block."""
@@ -78,6 +79,7 @@ def test_a_traced_gather_reads_the_rays_of_its_blocks(projector, sampled):
     np.testing.assert_array_equal(np.sort((place[read] & (1 << PLACE_BITS) - 1) // 4), np.sort(rule))
 
 
+@pytest.mark.slow(but="pixels")
 def test_no_projection_touches_much_more_than_it_needs(projector):
     with loops_for_a_gpu():
         passes = Passes(Projector(projector.blocks), GRID.shape, cameras=1)
@@ -89,6 +91,7 @@ def test_no_projection_touches_much_more_than_it_needs(projector):
             assert one.seconds > LAUNCH_S
 
 
+@pytest.mark.slow(but="pixels")
 def test_an_epoch_takes_every_subset_and_an_iteration_every_camera(projector):
     with loops_for_a_gpu():
         passes = Passes(Projector(projector.blocks), GRID.shape, cameras=2)
