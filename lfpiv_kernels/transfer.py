@@ -129,29 +129,6 @@ def block(values: Given, part: tuple[slice, ...]) -> Given:
     return cut.contiguous() if isinstance(cut, wp.array) else np.ascontiguousarray(cut)
 
 
-def host_bytes(size: int, *, locked: bool) -> wp.array:
-    """Return memory of the host [byte], page-locked for copies to a GPU if asked for and CUDA allows it."""
-    if locked and runtime.device().kind == "cuda":
-        try:
-            return wp.empty(size, dtype=wp.uint8, device="cpu", pinned=True)
-        except RuntimeError:
-            log.info("device: CUDA locks no more of the host's memory; copies from the rest of it are slower")
-    return wp.empty(size, dtype=wp.uint8, device="cpu")
-
-
-def copy_bytes(to: wp.array, source: wp.array, begin: int, end: int, stream: wp.Stream | None = None) -> None:
-    """Copy some bytes of the host's memory to the same places of the device's, on a stream if one is given."""
-    for counted in _counts:
-        counted.to_device.append(end - begin)
-    wp.copy(to, source, begin, begin, end - begin, stream)
-
-
-def view(memory: wp.array, begin: int, values: np.ndarray) -> wp.array:
-    """Return the array of the kind of `values` that begins at a byte of a device's memory, which must outlive it."""
-    dtype = wp.dtype_from_numpy(values.dtype)
-    return wp.array(ptr=memory.ptr + begin, dtype=dtype, shape=values.shape, device=memory.device)
-
-
 def to_host(array: Values) -> np.ndarray:
     """Return a device's array as one of NumPy, after all launches; on the CPU a view of the same memory.
 

@@ -118,9 +118,7 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     maps = sum(map(rays_bytes, calibration.cameras.values()))
     estimated = memory.weights_bytes(finest, run.particle_voxel) + maps
     worker_plan.require_memory(finest, estimated, 1)
-    need = memory_of(run, estimated, workers)
-    if need.device_streamed:
-        assumptions.append("one process alone copies weights to the GPU in each pass")
+    memory_of(run, estimated, workers)
     step(0.1)
     prepared = {} if calibrated else board_cost(experiment, calibration, assumptions)
     first = measure(run, calibration, scratch, calibrated=calibrated)
@@ -211,20 +209,18 @@ def memory_of(run: Run, weights: int, workers: int) -> Memory:
     """Estimate the memory for weights of a size [byte]; refuse a volume that cannot fit into the GPU."""
     finest = run.reconstructed_experiment
     free = runtime.free_bytes()
-    streamed, whole, least = 0, None, None
+    whole = None
     if free is not None:
         need = device_memory.estimate_need(finest)
         sharing = -(-workers // max(len(worker_plan.visible_gpus()), 1))
-        streamed = device_memory.require(finest, need, run.device, sharing=sharing)
-        whole, least = sharing * need.whole, sharing * (need.whole if sharing > 1 else need.least)
+        device_memory.require(finest, need, run.device, sharing=sharing)
+        whole = sharing * need.whole
     return Memory(
-        needed=memory.run_bytes(finest, weights + workers * streamed, workers),
+        needed=memory.run_bytes(finest, weights, workers),
         weights=weights,
         worker=memory.worker_bytes(finest),
         allowed=memory.allowed_bytes(finest),
         device_needed=whole,
-        device_least=least,
-        device_streamed=streamed,
         device_free=free,
     )
 

@@ -47,10 +47,6 @@ class Memory:
     """What a run may take here now."""
     device_needed: int | None
     """On each GPU, all weights included; None on the CPU."""
-    device_least: int | None
-    """On each GPU if weights are streamed, or all weights where processes share it; None on the CPU."""
-    device_streamed: int
-    """Weights that each pass copies to the GPU, as they do not fit; each worker holds them on the host besides."""
     device_free: int | None
     """Free memory of the GPU; None on the CPU."""
 
@@ -164,8 +160,6 @@ class Plan(Shown):
         ]
         if need.device_needed is not None and need.device_free is not None:
             text = f"{size_text(need.device_needed)} needed, {size_text(need.device_free)} free"
-            if need.device_streamed:
-                text += f"; {size_text(need.device_streamed)} of the weights pass through it in slabs, in each pass"
             facts.insert(-1, ("memory of the GPU", text))
         if disk.weights:
             facts.append(("while it runs", f"{size_text(disk.weights)} of disk for the weights that workers share"))

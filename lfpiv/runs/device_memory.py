@@ -1,11 +1,7 @@
-"""Estimate the memory that a run needs on a GPU, and refuse a run that cannot fit, before any work.
-
-Weights that do not fit are streamed, see `lfpiv_kernels.reconstruction.projector_streamed`; the rest must fit.
-"""
+"""Estimate the memory that a run needs on a GPU, and refuse a run that cannot fit, before any work."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,8 +15,6 @@ from lfpiv_kernels.runtime import Device
 if TYPE_CHECKING:
     from lfpiv.weights.device_share import DeviceNeed
 
-log = logging.getLogger(__name__)
-
 
 def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed:
     """Estimate the memory that a process needs on a GPU from the nominal rig, before any image is read.
@@ -33,10 +27,8 @@ def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed
     return need if weights else replace(need, cameras=())
 
 
-def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing: int = 1) -> int:
-    """Refuse a run whose arrays cannot fit into the memory of its GPU, and say if its weights are streamed.
-
-    Weights are streamed for a process that has its GPU to itself. Several processes on one must hold all of theirs.
+def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing: int = 1) -> None:
+    """Refuse a run whose arrays cannot fit into the memory of its GPU.
 
     Parameters
     ----------
@@ -49,31 +41,14 @@ def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing
     sharing : int
         Number of processes that share a GPU.
 
-    Returns
-    -------
-    int
-        Memory of the weights that are streamed, which each process holds on the host as well [byte].
-
     Raises
     ------
     InputError
         With the memory that is needed and that is free, and what to change.
     """
     free = runtime.free_bytes()
-    if free is None:
-        return 0
-    least = need.least if sharing == 1 else sharing * need.whole
-    if least > free:
+    if free is not None and sharing * need.whole > free:
         raise InputError(_refusal(experiment, need, device, sharing, free))
-    streamed = need.streamed(free) if sharing == 1 else 0
-    if streamed:
-        log.info(
-            "memory of the GPU: %s needed, %s free: of the weights' %s about %s are streamed, in %d slabs that each "
-            "pass copies anew",
-            *map(size_text, (need.whole, free, need.weights, streamed)),
-            need.slabs(free),
-        )
-    return streamed
 
 
 def _refusal(experiment: Experiment, need: DeviceNeed, device: Device, sharing: int, free: int) -> str:
@@ -84,7 +59,6 @@ def _refusal(experiment: Experiment, need: DeviceNeed, device: Device, sharing: 
         fits = max(free // max(need.whole, 1), 1)
         remedy = f"Use at most {fits} {'worker' if fits == 1 else 'workers'} per GPU"
     else:
-        needs += f", {size_text(need.least)} of it even if the weights are streamed"
         remedy = "Raise volume.voxel_mm"
     return (
         f"{experiment.path}: volume: {shape} voxels (z, y, x) and {len(experiment.cameras)} camera(s) need about "

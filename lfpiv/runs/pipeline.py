@@ -239,7 +239,7 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
         if not scheduler and runtime.free_bytes() is not None:
             need = device_memory.estimate_need(finest, weights=needed > 0)
             sharing = -(-planned.workers // max(len(gpus), 1))
-            needed += planned.workers * device_memory.require(finest, need, current.device, sharing=sharing)
+            device_memory.require(finest, need, current.device, sharing=sharing)
         worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
         if planned.workers > 1 and not scheduler:
             local_workers.start_preloading(planned.kind)

@@ -1,12 +1,11 @@
 """Memory of a GPU: what volumes, images and correlation take of it, and what is left for the weights.
 
-A GPU holds the weights of all cameras, or the part of them that fits; the volumes that SMART works on, and the images;
+A GPU holds the weights of all cameras; the volumes that SMART works on, and the images;
 then the volumes, the spline coefficients and a batch of windows of the correlation.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -16,17 +15,15 @@ from lfpiv.errors import InputError
 from lfpiv.files import MIB, size_text
 from lfpiv.geometry.grid import Grid
 from lfpiv_kernels import runtime
+from lfpiv_kernels.reconstruction import projector_gpu
 from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
 from lfpiv_kernels.reconstruction.projector import Blocks, Projector
 from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
-from lfpiv_kernels.reconstruction.projector_streamed import SLAB_BYTES, least_bytes
 from lfpiv_kernels.reconstruction.separable_gpu import device_bytes
 from lfpiv_kernels.reconstruction.separable_weights import PARTS, SeparableWeights
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
-
-log = logging.getLogger(__name__)
 
 VOLUMES, VOLUMES_PER_CAMERA = 10, 4
 """Largest number of volumes that SMART has on the GPU at once: coefficients, light, exponent, momentum, their sums and
@@ -48,32 +45,14 @@ class DeviceNeed:
     """Memory that a process needs on its GPU [byte]."""
 
     cameras: tuple[int, ...]
-    """Of the weights of each camera at once."""
+    """Of the weights of each camera."""
     beside: int
-    """Of all that cannot be streamed."""
-
-    @property
-    def weights(self) -> int:
-        """Of the weights of all cameras at once."""
-        return sum(self.cameras)
+    """Of volumes, images and all else."""
 
     @property
     def whole(self) -> int:
-        """What is needed so that nothing is streamed. Each camera has room for the buffers at least."""
-        return self.beside + sum(max(size, least_bytes()) for size in self.cameras)
-
-    @property
-    def least(self) -> int:
-        """What is needed if the weights are streamed."""
-        return self.beside + len(self.cameras) * least_bytes()
-
-    def streamed(self, free: int) -> int:
-        """Return the memory of the weights that each pass copies, and that the host holds for it, at a free memory."""
-        return 0 if free >= self.whole else max(self.weights - max(free - self.least, 0), 0)
-
-    def slabs(self, free: int) -> int:
-        """Return the number of slabs that are streamed at a free memory [byte], about."""
-        return -(-self.streamed(free) // SLAB_BYTES)
+        """Of all at once."""
+        return self.beside + sum(self.cameras)
 
 
 def rays_bytes(camera: CalibratedCamera) -> int:
@@ -103,57 +82,43 @@ class DeviceShare:
     def __init__(self, cameras: Collection[CalibratedCamera], grid: Grid):
         free = runtime.free_bytes()
         self._left = None if free is None else free - beside_bytes(cameras, grid)
-        self._to_come = len(cameras)
-        self._shape = grid.shape
 
     def holds(self, sizes: Iterable[int]) -> bool:
-        """Return whether the weights of all cameras [byte] fit at once; those of the CPU always do."""
-        return self._left is None or sum(max(size, least_bytes()) for size in sizes) <= self._left
+        """Return whether the weights of all cameras [byte] fit; those of the CPU always do."""
+        return self._left is None or sum(sizes) <= self._left
 
     def separable(self, name: str, weights: SeparableWeights, sets: int) -> SeparableProjector:
-        """Make the projector of the next camera from profiles of planes, which are not streamed.
-
-        Raises
-        ------
-        InputError
-            If they do not fit into the memory that is left.
-        """
-        self._to_come -= 1
+        """Make the projector of the next camera from profiles of planes; exceptions as of `projector`."""
         _, planes, columns = weights.shape
         lines, rays = (planes * weights.strips, columns), weights.ray_rows * weights.rays_of_row
-        size = device_bytes(weights.nbytes, weights.level.size // PARTS, lines, rays, weights.ray_rows)
-        if self._left is not None and size > self._left:
-            raise InputError(
-                f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
-                f"{size_text(max(self._left, 0))} are left. Use fewer workers per GPU, or --device cpu."
-            )
+        self._require(name, device_bytes(weights.nbytes, weights.level.size // PARTS, lines, rays, weights.ray_rows))
         projector = SeparableProjector(weights, sets)
-        if self._left is not None:
-            self._left -= projector.device_bytes
+        self._take(projector.device_bytes)
         return projector
 
     def projector(self, name: str, blocks: Blocks, planes: PlaneShares | None = None) -> Projector:
-        """Make the projector of the next camera. Its weights are streamed where they do not fit.
+        """Make the projector of the next camera.
 
         Raises
         ------
         InputError
-            If volumes and images leave too little memory even for streamed weights.
+            If the weights do not fit into the memory that is left.
         """
-        self._to_come -= 1
-        limit = None if self._left is None else self._left - self._to_come * least_bytes()
-        try:
-            projector = Projector(blocks, planes, limit)
-        except MemoryError as error:
-            voxels = " x ".join(map(str, self._shape))
-            raise InputError(f"volume: {voxels} voxels (z, y, x) on camera {name!r}: {error}") from None
-        if self._left is not None:
-            self._left -= projector.device_bytes
-        if (slabs := projector.streamed) is not None:
-            there, back = slabs.pass_bytes
-            log.info(
-                "weights of camera %r are streamed: %d slabs, %d stay on the GPU; a projection copies %s, a back "
-                "projection %s",
-                *(name, slabs.count, slabs.resident, size_text(there), size_text(back)),
-            )
+        counts, edge = (len(blocks.scale), len(blocks.ray), len(blocks.value)), blocks.microimages.edge
+        self._require(name, projector_gpu.device_bytes(blocks.form, *counts, edge=edge), projector_gpu.MOST_BYTES)
+        projector = Projector(blocks, planes)
+        self._take(projector.device_bytes)
         return projector
+
+    def _require(self, name: str, size: int, most: float = math.inf) -> None:
+        """Refuse weights of a camera [byte] that do not fit."""
+        if self._left is not None and size > (left := min(self._left, most)):
+            raise InputError(
+                f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
+                f"{size_text(max(left, 0))} are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers "
+                "per GPU, or --device cpu."
+            )
+
+    def _take(self, size: int) -> None:
+        if self._left is not None:
+            self._left -= size

@@ -372,8 +372,8 @@ def build_weights(
     ValueError
         If `method`, `form` or `rays` is unknown, or profiles are requested for a hexagonal microlens layout.
     InputError
-        If the weights would not fit into `limit_bytes`, raised before they are computed. If volumes and images leave no
-        memory of the GPU for streamed weights.
+        If the weights would not fit into `limit_bytes`, raised before they are computed. If they do
+        not fit into the memory of the GPU beside volumes and images.
     """
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}.")

@@ -96,7 +96,7 @@ def possible_planes(
 ) -> dict[str, Planes] | None:
     """Return the planes of all cameras; None where their profiles do not suit the cameras or do not fit a GPU.
 
-    Whether they are accurate is not looked at. They cannot be streamed, as the weights of voxels can.
+    Whether they are accurate is not looked at.
     """
     if not are_possible(stored, cameras):
         return None

@@ -170,8 +170,7 @@ struct TileLight {
 };
 
 /// Write the light of all voxels on one tile's rays; dark if the tile's lens is none of `lenses`. The warp goes through
-/// the list of the tile's blocks, 32 at a time, in the order of the voxels. A matrix that adds goes on from the light
-/// on the rays, so that slabs of voxels, one after the other, give the same sums as all at once.
+/// the list of the tile's blocks, 32 at a time, in the order of the voxels.
 template <class Matrix>
 LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const float* volume, float* rays_out) {
 #if defined(__CUDA_ARCH__)
@@ -183,14 +182,9 @@ LFPIV_INLINE void scatter_tile(const Matrix& matrix, int tile, int lenses, const
 #endif
     const int head = matrix.tile_size.data[tile], rows = head & 0xff, columns = (head >> 8) & 0xff, set = head >> 16;
     const bool lit = lenses < 0 || lenses == set;
-    if (matrix.adds && !lit) return;  // the whole warp
     float* const out = rays_out + matrix.tile_ray.data[tile];
     for_lanes([&](int lane) {
-        for (int k = lane; k < TILE * TILE; k += LANES_OF_WARP) {
-            const int row = k / TILE, column = k % TILE;
-            const float* const at = out + (int64_t)row * matrix.pitch + column;
-            light.ray[k] = matrix.adds && row < rows && column < columns ? *at : 0.0f;
-        }
+        for (int k = lane; k < TILE * TILE; k += LANES_OF_WARP) light.ray[k] = 0.0f;
     });
     sync_lanes();
     const int64_t end = lit ? matrix.tile_entry.data[tile + 1] : 0;

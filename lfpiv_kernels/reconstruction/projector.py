@@ -18,7 +18,6 @@ from lfpiv_kernels.reconstruction import voxels
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
-from lfpiv_kernels.reconstruction.projector_streamed import StreamedProjector, fits_whole
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
 from lfpiv_kernels.transfer import Given, Values, bytes_on_device, overwrite, to_device, to_host, zeros
@@ -141,11 +140,9 @@ class Projector(RayProjector):
     both parts and is added up.
 
     With `planes` the blocks are those of nodes on planes across the line of sight: voxels -> nodes -> rays, and back.
-
-    On a GPU whose `limit_bytes` do not hold all weights they are streamed, see `projector_streamed`. Results are equal.
     """
 
-    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None, limit_bytes: int | None = None):
+    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None):
         super().__init__()
         self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
         self.planes = planes
@@ -154,10 +151,7 @@ class Projector(RayProjector):
         self._on_cpu = runtime.device().form == "cpu"
         self.ray_sets = 1 if blocks.even_blocks is None else 2
         """Sets of rays that can be taken alone: those of even and of odd lenses."""
-        self._tiled: TiledProjector | StreamedProjector | None = None
-        if not self._on_cpu:
-            whole = limit_bytes is None or fits_whole(blocks, limit_bytes)
-            self._tiled = TiledProjector(blocks) if whole else StreamedProjector(blocks, limit_bytes)
+        self._tiled = None if self._on_cpu else TiledProjector(blocks)
         if self._tiled is not None:
             self.rays = self._tiled.rays
             self.map = self._map_rays()
@@ -191,11 +185,6 @@ class Projector(RayProjector):
     def device_bytes(self) -> int:
         """Memory of the weights on a GPU [byte]; 0 on the CPU, where they are those of the host."""
         return 0 if self._tiled is None else self._tiled.nbytes
-
-    @property
-    def streamed(self) -> StreamedProjector | None:
-        """The slabs of weights that do not fit into the memory of the GPU; None where all weights are there."""
-        return self._tiled if isinstance(self._tiled, StreamedProjector) else None
 
     def _find_spans(self) -> list[tuple[int, int]]:
         """Return the first ray that each part of the voxels can touch, and the end of its rays."""

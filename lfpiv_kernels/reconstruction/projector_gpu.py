@@ -24,6 +24,8 @@ TILE: int = native.constant("projector_gpu.h", "TILE")
 """Rays along each side of a tile at most."""
 ALIGNED_RAYS = SECTOR // 4
 """Rays of a sector."""
+MOST_BYTES = SECTOR * np.iinfo(np.int32).max
+"""Most memory of a camera's weights on a GPU [byte]: indices of sectors have 32 bits."""
 ENTRY_BYTES, HEAD_BYTES = 12, 6
 """Memory of a block in the list of its tile, and of its ray, height and width [byte]."""
 
@@ -55,8 +57,6 @@ class TiledMatrix:
     sectors: int
     pitch: int
     profiles: bool
-    adds: bool
-    """Whether a scatter adds to the light on the rays: for one slab of voxels after the other."""
 
 
 @wp.func_native("lfpiv::count_entries(matrix, level.data, {edge, side}, count_out.data, set_out.data);")
@@ -164,8 +164,14 @@ def _write_entries(
     _write_entries_of(matrix, level, edge, side, next_out, voxel_out, start_out, place_out)
 
 
-class TiledRays:
-    """The light on a camera's rays as it lies in the memory of a GPU: rows of rays begin sectors."""
+class TiledProjector:
+    """The weights of one camera as a GPU reads them, and the light on its rays. Rows of rays begin sectors.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        The weights.
+    """
 
     def __init__(self, blocks: Blocks):
         self._edge = blocks.microimages.edge
@@ -175,6 +181,15 @@ class TiledRays:
         size = (self._rows + beyond) * self._pitch
         self.rays = wp.zeros(size, dtype=float, device=runtime.device().warp)
         """The light on the rays. Those that no voxel lights stay dark."""
+        self.matrix = self._matrix_of(blocks)
+        """The weights on the device."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the weights on the device [byte]."""
+        values = (getattr(self.matrix, name) for name in TiledMatrix.vars)
+        arrays = (value for value in values if isinstance(value, wp.array))
+        return sum(value.size * wp.types.type_size_in_bytes(value.dtype) for value in arrays)
 
     def places(self, ray: np.ndarray) -> np.ndarray:
         """Return where rays lie in memory, int32."""
@@ -185,31 +200,33 @@ class TiledRays:
         """Return values of rays as they lie in memory in the order of the rays, shape (ray,)."""
         return rays[: self._rows * self._pitch].reshape(self._rows, self._pitch)[:, : self._edge].ravel()
 
-    def matrix_of(self, blocks: Blocks) -> tuple[TiledMatrix, dict[str, np.ndarray]]:
-        """Return a matrix of the camera's blocks, or of those of a slab, that has no arrays yet, and all but `word`.
-
-        The arrays are made by one thread of the host: bound by memory.
-        """
+    def _matrix_of(self, blocks: Blocks) -> TiledMatrix:
+        """Return the matrix of the camera's blocks. One thread of the host makes its arrays: bound by memory."""
         matrix = TiledMatrix()
         matrix.profiles = blocks.form == "profiles"
         matrix.pitch = self._pitch
-        starts = np.zeros(0, np.int64)
         if matrix.profiles:
             matrix.sectors = profile_sectors(blocks)
+            starts, sectors = np.zeros(0, np.int64), matrix.sectors * len(blocks.ray)
         else:
             sizes = -(-blocks.height.astype(np.int64) * blocks.width // SECTOR)
-            starts = np.append(0, sizes.cumsum())
+            starts, sectors = np.append(0, sizes.cumsum())[:-1], int(sizes.sum())
         even = np.diff(blocks.first_block) if blocks.even_blocks is None else blocks.even_blocks
         arrays = {
             "first_block": blocks.first_block,
             "even_blocks": even.astype(np.int32),
             "height": blocks.height,
             "width": blocks.width,
-            "start": starts[:-1].astype(np.int32),
+            "start": starts.astype(np.int32),
             "scale": blocks.scale,
         }
         tiles = self._tiles(blocks, matrix, arrays)
-        return matrix, {**arrays, "ray": self.places(blocks.ray), **tiles}
+        for name, array in {**arrays, "ray": self.places(blocks.ray), **tiles}.items():
+            setattr(matrix, name, to_device(array))
+        matrix.word = wp.zeros(max(sectors, 1) * SECTOR // 4, dtype=wp.uint32, device=runtime.device().warp)
+        values = [to_device(blocks.first_value), bytes_on_device(blocks.value)]
+        launch(Call(_align, len(blocks.scale), [matrix, *values], [matrix.word]))
+        return matrix
 
     def _tiles(self, blocks: Blocks, matrix: TiledMatrix, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the arrays of the tiles that are lit and of their entries."""
@@ -242,66 +259,23 @@ class TiledRays:
             **dict(zip(("entry_voxel", "entry_start", "entry_place"), entries, strict=True)),
         }
 
-    def scatter_of(self, matrix: TiledMatrix, volume: wp.array, lenses: int) -> None:
-        """Launch a matrix's scatter of the light of `volume` to the rays of some lenses."""
-        tiles = len(matrix.tile_ray)
-        launch(Call(_scatter, tiles, [matrix, volume, lenses], [self.rays], inner=lanes_of_warp()))
-
-    def gather_of(self, matrix: TiledMatrix, volume_out: wp.array, active: wp.array, lenses: int) -> None:
-        """Launch a matrix's gather of the light on the rays of some lenses."""
-        inputs = [matrix, self.rays, active, lenses]
-        launch(Call(_gather, len(volume_out), inputs, [volume_out], inner=lanes_of_warp()))
-
-    def count_of(self, matrix: TiledMatrix, share: wp.array, count_out: wp.array) -> None:
-        """Launch a matrix's count of the rays that each voxel lights, those whose placed `share` is not zero."""
-        launch(Call(_count_lit, len(count_out), [matrix, share], [count_out], inner=lanes_of_warp()))
-
-    def placed(self, share: np.ndarray) -> wp.array:
-        """Return values of the rays on the device where the rays lie in memory."""
-        placed = np.zeros(len(self.rays), np.float32)
-        placed[self.places(np.arange(len(share)))] = share
-        return to_device(placed)
-
-
-class TiledProjector(TiledRays):
-    """The weights of one camera as a GPU reads them, and the light on its rays.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        The weights.
-    """
-
-    def __init__(self, blocks: Blocks):
-        super().__init__(blocks)
-        matrix, arrays = self.matrix_of(blocks)
-        for name, array in arrays.items():
-            setattr(matrix, name, to_device(array))
-        matrix.word = wp.zeros(word_count(matrix, arrays), dtype=wp.uint32, device=runtime.device().warp)
-        values = [to_device(blocks.first_value), bytes_on_device(blocks.value)]
-        launch(Call(_align, len(blocks.scale), [matrix, *values], [matrix.word]))
-        self.matrix = matrix
-        """The weights on the device."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the weights on the device [byte]."""
-        values = (getattr(self.matrix, name) for name in TiledMatrix.vars)
-        arrays = (value for value in values if isinstance(value, wp.array))
-        return sum(value.size * wp.types.type_size_in_bytes(value.dtype) for value in arrays)
-
     def scatter(self, volume: wp.array, lenses: int) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
-        self.scatter_of(self.matrix, volume, lenses)
+        tiles = len(self.matrix.tile_ray)
+        launch(Call(_scatter, tiles, [self.matrix, volume, lenses], [self.rays], inner=lanes_of_warp()))
 
     def gather(self, volume_out: wp.array, active: wp.array, lenses: int) -> None:
         """Add the weighted sum of the light on each active voxel's rays of some lenses to `volume_out`."""
-        self.gather_of(self.matrix, volume_out, active, lenses)
+        inputs = [self.matrix, self.rays, active, lenses]
+        launch(Call(_gather, len(volume_out), inputs, [volume_out], inner=lanes_of_warp()))
 
     def count_lit(self, share: np.ndarray) -> wp.array:
         """Count the rays that each voxel lights, shape (voxel,), int32. Those whose `share` is zero do not count."""
+        placed = np.zeros(len(self.rays), np.float32)
+        placed[self.places(np.arange(len(share)))] = share
         count = wp.zeros(len(self.matrix.scale), dtype=int, device=runtime.device().warp)
-        self.count_of(self.matrix, self.placed(share), count)
+        inputs = [self.matrix, to_device(placed)]
+        launch(Call(_count_lit, len(count), inputs, [count], inner=lanes_of_warp()))
         return count
 
 
@@ -315,26 +289,6 @@ def tiles_per_edge(edge: int) -> int:
     return -(-edge // TILE)
 
 
-def word_count(matrix: TiledMatrix, arrays: dict[str, np.ndarray]) -> int:
-    """Return the number of words that a matrix's values take, of one sector at least."""
-    sectors = matrix.sectors * len(arrays["ray"])
-    if not matrix.profiles and len(arrays["ray"]):
-        sectors = int(arrays["start"][-1]) - (-int(arrays["height"][-1]) * int(arrays["width"][-1]) // SECTOR)
-    return max(sectors, 1) * SECTOR // 4
-
-
-def align_on_host(matrix: TiledMatrix, arrays: dict[str, np.ndarray], blocks: Blocks) -> np.ndarray:
-    """Return the values of a matrix's blocks in the host's memory, uint32: each block begins a sector."""
-    word = np.zeros(word_count(matrix, arrays), np.uint32)
-    work = TiledMatrix()
-    work.profiles, work.sectors = matrix.profiles, matrix.sectors
-    for name in ("first_block", "height", "width", "start"):
-        setattr(work, name, to_device(arrays[name], device="cpu"))
-    values = [to_device(blocks.first_value, device="cpu"), bytes_on_device(blocks.value, "cpu")]
-    _run_on_host(_align, [work, *values, 0], [word], len(blocks.scale))
-    return word
-
-
 def device_bytes(form: str, voxels: int, blocks: int, values: int, *, edge: int) -> int:
     """Return the memory of one camera's weights on a GPU [byte], from the numbers of voxels, blocks and values."""
     aligned = SECTOR * -(-(ALIGNED_RAYS + edge) // SECTOR) * blocks
@@ -343,8 +297,8 @@ def device_bytes(form: str, voxels: int, blocks: int, values: int, *, edge: int)
     return aligned + (ENTRY_BYTES + HEAD_BYTES) * blocks + 12 * voxels
 
 
-def _run_on_host(kernel: wp.Kernel, inputs: list[object], outputs: list[np.ndarray], threads: int = 1) -> None:
-    """Run a kernel on arrays in the host's memory, one thread after the other."""
+def _run_on_host(kernel: wp.Kernel, inputs: list[object], outputs: list[np.ndarray]) -> None:
+    """Run a kernel on arrays in the host's memory by one thread."""
     runtime.device()
     arrays = [to_device(array, device="cpu") for array in outputs]
-    wp.launch(kernel, dim=threads, inputs=inputs, outputs=arrays, device="cpu")
+    wp.launch(kernel, dim=1, inputs=inputs, outputs=arrays, device="cpu")

@@ -1,12 +1,12 @@
 """Weights of one camera as 8-bit blocks of rays, on the host."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
 from lfpiv_kernels.weights.microimages import Microimages
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
+from lfpiv_kernels.weights.ray_model import LEVELS
 
 LOOKED_AT = 16384
 """Voxels among whose weights the largest one is looked for at once."""
@@ -49,23 +49,6 @@ class Blocks:
         """Memory of all arrays [byte]."""
         names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")
         return sum(array.nbytes for array in (getattr(self, name) for name in names) if array is not None)
-
-    def part(self, first: int, last: int) -> "Blocks":
-        """Return the blocks of the voxels from `first` to before `last`. Blocks and values are not copied."""
-        block, end = int(self.first_block[first]), int(self.first_block[last])
-        value, values_end = int(self.first_value[first]), int(self.first_value[last])
-        return replace(
-            self,
-            first_block=self.first_block[first : last + 1] - np.int32(block),
-            first_value=self.first_value[first : last + 1] - value,
-            value=self.value[value : values_end + BLOCK_WIDTH],
-            **{name: getattr(self, name)[block:end] for name in ("ray", "height", "width")},
-            **{
-                name: array[first:last]
-                for name in ("scale", "even_blocks", "even_values")
-                if (array := getattr(self, name)) is not None
-            },
-        )
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""

@@ -57,8 +57,7 @@ def test_the_memory_is_what_a_run_announces(planned, small_run):
     assert planned.memory.weights - maps == pytest.approx(built)
     assert built < planned.disk.weights < planned.memory.weights
     memory_of = planned.memory
-    assert memory_of.device_needed is memory_of.device_least is memory_of.device_free is None
-    assert memory_of.device_streamed == 0
+    assert memory_of.device_needed is memory_of.device_free is None
 
 
 def test_two_workers_share_pairs_and_threads(planned):
@@ -134,28 +133,18 @@ GPU = Device("cuda", 8, "gpu", name="NVIDIA TEST", memory_bytes=4 * GIB, driver=
 def test_a_volume_that_cannot_fit_into_the_gpu_is_refused(small_run, monkeypatch):
     experiment = read_experiment(small_run.experiment)
     need = dataclasses.replace(device_memory.estimate_need(experiment), cameras=(GIB // 4, 3 * GIB // 4))
-    assert need.weights == GIB and need.least < need.whole and need.whole > GIB + 4 * experiment.grid.size
+    assert need.whole > GIB + 4 * experiment.grid.size
 
     def require(free, sharing=1):
         monkeypatch.setattr(runtime, "free_bytes", lambda: free)
-        return device_memory.require(experiment, need, GPU, sharing=sharing)
+        device_memory.require(experiment, need, GPU, sharing=sharing)
 
-    assert require(need.whole) == 0
-    assert require(need.least) == GIB  # nothing stays on the GPU
-    assert require((need.whole + need.least) // 2) == GIB - (need.whole - need.least) // 2
-    with pytest.raises(InputError, match=r"even if the weights are streamed; .* free on NVIDIA TEST\. Raise"):
-        require(need.least - 1)
+    require(need.whole)
+    require(3 * need.whole, sharing=3)
+    with pytest.raises(InputError, match=r"GiB of the GPU's memory; .* free on NVIDIA TEST\. Raise"):
+        require(need.whole - 1)
     with pytest.raises(InputError, match="Use at most 2 workers per GPU"):
         require(2 * need.whole, sharing=3)
-
-
-def test_a_run_says_that_weights_are_streamed(small_run, monkeypatch, caplog):
-    experiment = read_experiment(small_run.experiment)
-    need = dataclasses.replace(device_memory.estimate_need(experiment), cameras=(GIB // 4, 3 * GIB // 4))
-    monkeypatch.setattr(runtime, "free_bytes", lambda: need.least)
-    caplog.set_level("INFO", "lfpiv")
-    device_memory.require(experiment, need, GPU)
-    assert "of the weights' 1.0 GiB about 1.0 GiB are streamed, in 16 slabs that each pass copies anew" in caplog.text
 
 
 def test_a_run_that_cannot_fit_into_the_gpu_begins_no_work(small_run, tmp_path, monkeypatch, capfd):

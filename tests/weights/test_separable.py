@@ -83,7 +83,6 @@ def test_profiles_are_not_shared_beyond_the_memory_that_is_left(both):
 
 
 def test_profiles_are_shared_only_where_a_gpu_holds_them(both, tmp_path, monkeypatch):
-    """What a GPU does not hold is stored in blocks, which can be streamed."""
     shared, _ = both
     cameras = shared.cameras
     rig, beside = rig_of(*cameras.values()), beside_bytes(cameras.values(), GRID)
