@@ -146,7 +146,7 @@ class Model:
             weights = lfpiv.build_weights(rig(of["sensor"]), voxels, form=form)
         first, *others = map(weights.projector, weights.cameras)
         with loops_for_a_gpu():
-            projector = Projector(first.blocks, first.planes)
+            projector = type(first)(*first.parts)
             self.weights_bytes = projector.device_bytes + sum(TiledProjector(one.blocks).nbytes for one in others)
             """Memory of all cameras' weights on the GPU."""
         self.stored_bytes = weights.memory_bytes

@@ -26,7 +26,7 @@ from lfpiv.runs import device_memory, memory, rig, worker_plan
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.run import Run, open_run
 from lfpiv.velocity import vector_grid
-from lfpiv.weights.device_share import rays_bytes
+from lfpiv.weights.memory_left import rays_bytes
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import cores
 

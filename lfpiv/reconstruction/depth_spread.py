@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lfpiv.weights.depth_planes import line_of_sight
+from lfpiv.weights.forms.node_grid import line_of_sight
 from lfpiv.weights.operator import Weights
 
 LEAST_SHARE = 0.5

@@ -86,12 +86,12 @@ def reconstruct(
         Stop when the misfit falls by less than this fraction in an iteration; 0 runs all iterations.
     subsets : int or "auto"
         Number of ordered subsets of the rays, each of which makes a step (`lfpiv.reconstruction.ordered_subsets`): 1
-        for SMART as above, or more. Where planes of voxels share profiles (`lfpiv.weights.separable`) a subset is some
-        rows of pixels under the lenses of all cameras, and there are up to 16, by default as many as possible, until
-        they contradict each other or have made 128 steps. Otherwise it is a camera or half of its lenses: "auto" takes
-        halves of one or two cameras, until they contradict each other, then whole cameras, as for more of them. An
-        iteration is a pass over all subsets; the last two iterations, at most half of them, are SMART's own. "auto" is
-        1 without `accelerate`, or with "paper".
+        for SMART as above, or more. Where planes of voxels share profiles (`lfpiv.weights.forms.shared_profiles`) a
+        subset is some rows of pixels under the lenses of all cameras, and there are up to 16, by default as many as
+        possible, until they contradict each other or have made 128 steps. Otherwise it is a camera or half of its
+        lenses: "auto" takes halves of one or two cameras, until they contradict each other, then whole cameras, as for
+        more of them. An iteration is a pass over all subsets; the last two iterations, at most half of them, are
+        SMART's own. "auto" is 1 without `accelerate`, or with "paper".
     first : ndarray, shape (z, y, x), optional
         First guess, to continue an iteration or to start from your own; with a sieve, of c. Finite and >= 0. Voxels
         that are zero stay zero and cost no time.

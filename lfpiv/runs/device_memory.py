@@ -13,7 +13,7 @@ from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import Device
 
 if TYPE_CHECKING:
-    from lfpiv.weights.device_share import DeviceNeed
+    from lfpiv.weights.memory_left import DeviceNeed
 
 
 def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed:

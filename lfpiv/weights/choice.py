@@ -9,14 +9,12 @@ must be cut if its edges lie oblique to the microlenses.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv.errors import InputError
-from lfpiv.geometry.grid import Grid
 from lfpiv.warn import Code, Warning, warn
 from lfpiv.weights.blocks import WHOLE, Cuts, PackedCamera, blocks_of
 from lfpiv.weights.counting import CountedVoxels, draw_seen
@@ -107,25 +105,6 @@ def choose_uncounted(stored: StoredGrid, camera: CalibratedCamera, form: str) ->
         text = "weights of camera %s are stored pixel by pixel: products of profiles need square microlenses"
         log.info(text, camera.name)
     return Choice(form="pixels", cuts=choose_cuts(stored, camera))
-
-
-def memory_check(name: str, grid: Grid, choice: Choice, left: float) -> Callable[[int], None]:
-    """Return a check that refuses weights of more than `left` byte."""
-    other = ""
-    if choice.profile_errors and choice.form == "pixels":
-        percent = 100 * np.mean(choice.profile_errors)
-        other = f", or set compute.weights_form to 'profiles', {percent:.0f} % from counted rays here"
-
-    def allow(needed: int) -> None:
-        if needed > left:
-            voxels = " x ".join(map(str, grid.shape))
-            raise InputError(
-                f"volume: the weights of {voxels} voxels (z, y, x) on camera {name!r} need {needed / 2**30:.1f} GiB as "
-                f"{choice.form}, {max(left, 0) / 2**30:.1f} GiB are left. Raise volume.voxel_mm, shrink "
-                f"volume.size_mm{other}."
-            )
-
-    return allow
 
 
 def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[float]:

@@ -1,8 +1,8 @@
 """`build_weights`: calibrated mapping and grid -> the weights of Eq. 10 as a linear operator W.
 
 ``weights(volume)`` projects a volume onto images (Eq. 4), ``weights.T(images)`` is the adjoint. Two methods give the
-weights: "footprint" integrates them in closed form (`lfpiv.weights.blocks`), "count" traces rays and counts them, as
-the paper does (`lfpiv.weights.counted_grid`). Both are stored as 8-bit blocks with one scale per voxel.
+weights: "footprint" integrates them in closed form, "count" traces rays and counts them, as the paper does. They are
+stored in one of the forms of `lfpiv.weights.forms.table`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,14 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.prompt import Card, Shown
 from lfpiv.settings.processing import Compute
 from lfpiv.weights.adjoint import Adjoint, checked_out
-from lfpiv.weights.blocks import Cuts, footprint_blocks
+from lfpiv.weights.blocks import Cuts
 from lfpiv.weights.card import card_of
-from lfpiv.weights.choice import Choice, choose_forms, memory_check
-from lfpiv.weights.counted_grid import count_blocks
+from lfpiv.weights.choice import Choice, choose_forms
 from lfpiv.weights.counting import CountedVoxels, add_entries
-from lfpiv.weights.depth_planes import choose_planes
-from lfpiv.weights.device_share import DeviceShare
 from lfpiv.weights.even_light import EvenLight, project_even_light
-from lfpiv.weights.separable import choose_separable
+from lfpiv.weights.forms import table
+from lfpiv.weights.forms.form import Rig
+from lfpiv.weights.memory_left import MemoryLeft
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
@@ -194,6 +193,10 @@ class Weights(Shown):
         """Camera name -> form in which its weights are stored."""
         return {name: projector.form for name, projector in self._projectors.items()}
 
+    def choice(self, name: str) -> Choice:
+        """Return how a camera's footprints were computed."""
+        return self._choices.get(name) or Choice(form=self._projectors[name].form)
+
     @property
     def cuts(self) -> dict[str, Cuts]:
         """Camera name -> parts of a voxel along x, y, z whose footprints were added."""
@@ -350,9 +353,9 @@ def build_weights(
         microlenses. "pixels": one value per pixel, for any optics. "auto": profiles for each camera where they agree
         with counted rays.
     planes : bool
-        Store profiles that planes of voxels share where that is accurate, see `lfpiv.weights.separable`, or the weights
-        of nodes on planes across each camera's line of sight, see `lfpiv.weights.depth_planes`. False: the weights of
-        every voxel.
+        Store profiles that planes of voxels share where that is accurate, see `lfpiv.weights.forms.shared_profiles`, or
+        the weights of nodes on planes across each camera's line of sight, see `lfpiv.weights.forms.nodes`. False: the
+        weights of every voxel.
     particle_voxel : float
         Standard deviation of the particles [voxel], 0 if unknown. Below 0.85 only cameras near 0, 45 and 90 degrees to
         the grid's axes have planes.
@@ -388,31 +391,23 @@ def build_weights(
         raise ValueError(f"form: 'profiles' need square microlenses, those of camera {hexagonal[0]!r} are hexagonal.")
     stored = StoredGrid.for_cameras(grid, cameras.values())
     runtime.device()
-    share = DeviceShare(cameras.values(), grid)
-    projectors, choices, counted = dict[str, RayProjector](), dict[str, Choice](), dict[str, CountedVoxels]()
-    whole = progress or (lambda fraction: None)
-    if method == "footprint":
-        choices, counted = choose_forms(stored, cameras, form)
-    if planes and choices and all(choice.form == "profiles" for choice in choices.values()):
-        columns_inmost = StoredGrid.for_cameras(grid, cameras.values(), columns_inmost=True)
-        separable = choose_separable(columns_inmost, cameras, share, limit_bytes, whole)
-        if separable is not None:
-            stored = columns_inmost
-            projectors.update(separable)
-    for number, (name, camera) in enumerate(cameras.items()):
-        if name in projectors:
-            continue
-        used = sum(projector.nbytes for projector in projectors.values())
-        step = part_of(whole, number / len(cameras), (number + 1) / len(cameras))
-        if method == "count":
-            allow = memory_check(name, grid, Choice(form="pixels"), limit_bytes - used)
-            projectors[name] = share.projector(name, count_blocks(stored, camera, rays, step, allow))
-            continue
-        chosen = choices[name]
-        allow = memory_check(name, grid, chosen, limit_bytes - used)
-        nodes = choose_planes(stored, camera, chosen.form, chosen.cuts, particle_voxel) if planes else None
-        blocks = footprint_blocks(nodes or stored, camera, chosen.form, step, allow, chosen.cuts)
-        projectors[name] = share.projector(name, blocks, nodes.shares if nodes else None)
+    footprints = method == "footprint"
+    choices, counted = choose_forms(stored, cameras, form) if footprints else ({}, {})
+    rig = Rig(
+        stored=stored,
+        cameras=cameras,
+        memory=MemoryLeft(cameras.values(), grid, limit_bytes),
+        choices=choices,
+        rays=0 if footprints else rays,
+        shared=planes and footprints,
+        particle_voxel=particle_voxel,
+    )
+    whole, order = progress or (lambda fraction: None), list(cameras)
+
+    def step(name: str) -> StepProgress:
+        return part_of(whole, order.index(name) / len(order), (order.index(name) + 1) / len(order))
+
+    stored, projectors = table.build(rig, step)
     weights = Weights(stored, cameras, projectors, method, choices=choices, counted=counted)
     log.info("weights: %d voxels, %d cameras, %s", grid.size, len(cameras), size_text(weights.memory_bytes))
     return weights

@@ -19,21 +19,16 @@ from lfpiv import files
 from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.device_share import DeviceShare
+from lfpiv.weights.forms.table import form_named, form_of
+from lfpiv.weights.memory_left import MemoryLeft
 from lfpiv.weights.operator import Weights
-from lfpiv.weights.separable import ray_sets
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
-from lfpiv_kernels.reconstruction.projector import Blocks, Projector
-from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
-from lfpiv_kernels.reconstruction.ray_projector import RayProjector
-from lfpiv_kernels.reconstruction.separable_weights import SeparableWeights
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 _HEADER = "weights.json"
 _HASHED_BYTES = 1 << 24
 """Size of the pieces in which arrays are hashed [byte]."""
@@ -60,7 +55,7 @@ def save_weights(weights: Weights, folder: Path) -> str:
         If the folder cannot be written or the disk is full.
     """
     digest = hashlib.blake2b(digest_size=16)
-    stored = {name: _parts_of(weights.projector(name)) for name in weights.cameras}
+    projectors = [weights.projector(name) for name in weights.cameras]
 
     def put(name: str, value: Any) -> Any:
         """Write an array, or the arrays of a dataclass; return its entry of the header."""
@@ -86,8 +81,8 @@ def save_weights(weights: Weights, folder: Path) -> str:
             "method": weights.method,
             "camera_sums": put("camera_sums", weights.camera_sums),
             "cameras": {
-                name: [type(parts[0]).__name__, *(put(f"camera{number}.{k}", part) for k, part in enumerate(parts))]
-                for number, (name, parts) in enumerate(stored.items())
+                name: [form_of(one).__name__, *(put(f"camera{number}.{k}", part) for k, part in enumerate(one.parts))]
+                for number, (name, one) in enumerate(zip(weights.cameras, projectors, strict=True))
             },
         }
         content = digest.hexdigest()
@@ -126,35 +121,19 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
         grid = Grid(**{name: _tuple(value) for name, value in header["grid"].items()})
         arrays: dict[str, np.ndarray] = {}
         camera_sums = _map(folder, header["camera_sums"], arrays)
-        parts: dict[str, list[Any]] = {}
+        forms, parts = {}, {}
         for name, (kind, *entries) in header["cameras"].items():
-            parts[name] = [
-                None if entry is None else _take(one, folder, entry, arrays)
-                for one, entry in zip(_STORED[kind], entries, strict=True)
-            ]
+            forms[name] = form_named(kind)
+            pairs = zip(forms[name].parts, entries, strict=True)
+            parts[name] = [_take(one, folder, entry, arrays) for one, entry in pairs]
         if content not in (None, _content(arrays)):
             raise ValueError("weights of another run")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the weights of this run, found none that fit ({error}).") from None
     stored = StoredGrid(grid, _tuple(header["order"]))
-    share, sets = DeviceShare(cameras.values(), grid), ray_sets(cameras)
-    projectors: dict[str, RayProjector] = {
-        name: share.separable(name, own[0], sets) if len(own) == 1 else share.projector(name, own[0], own[1])
-        for name, own in parts.items()
-    }
+    memory = MemoryLeft(cameras.values(), grid)
+    projectors = {name: forms[name].load(name, own, cameras, memory) for name, own in parts.items()}
     return Weights(stored, cameras, projectors, header["method"], camera_sums=np.array(camera_sums))
-
-
-_STORED: dict[str, tuple[type, ...]] = {"Blocks": (Blocks, PlaneShares), "SeparableWeights": (SeparableWeights,)}
-"""Types of what is stored of a camera's weights, by the name of the first one."""
-
-
-def _parts_of(projector: RayProjector) -> list[Any]:
-    """Return what is stored of the weights of a projector."""
-    if isinstance(projector, SeparableProjector):
-        return [projector.weights]
-    assert isinstance(projector, Projector)
-    return [projector.blocks, projector.planes]
 
 
 def _content(arrays: Mapping[str, np.ndarray]) -> str:

@@ -15,12 +15,11 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.reconstruction import voxels
-from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes, PlaneShares
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.weight_blocks import Blocks
-from lfpiv_kernels.transfer import Given, Values, bytes_on_device, overwrite, to_device, to_host, zeros
+from lfpiv_kernels.transfer import Given, Values, bytes_on_device, overwrite, to_device, to_host
 from lfpiv_kernels.weights.microimages import Microimages
 from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 
@@ -138,20 +137,15 @@ class Projector(RayProjector):
     Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads write the same
     ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts light lies in
     both parts and is added up.
-
-    With `planes` the blocks are those of nodes on planes across the line of sight: voxels -> nodes -> rays, and back.
     """
 
-    def __init__(self, blocks: Blocks, planes: PlaneShares | None = None):
+    def __init__(self, blocks: Blocks):
         super().__init__()
         self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
-        self.planes = planes
-        """How voxels are shared among the nodes whose weights `blocks` are; None if these are the voxels."""
-        self._planes = None if planes is None else DepthPlanes(planes)
-        self._on_cpu = runtime.device().form == "cpu"
+        self.parts = (blocks,)
         self.ray_sets = 1 if blocks.even_blocks is None else 2
         """Sets of rays that can be taken alone: those of even and of odd lenses."""
-        self._tiled = None if self._on_cpu else TiledProjector(blocks)
+        self._tiled = TiledProjector(blocks) if runtime.device().form == "gpu" else None
         if self._tiled is not None:
             self.rays = self._tiled.rays
             self.map = self._map_rays()
@@ -201,7 +195,7 @@ class Projector(RayProjector):
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
-        self._scatter(voxels.ones(len(self.blocks.scale)), ALL)
+        Projector.scatter(self, voxels.ones(len(self.blocks.scale)))
         rays = self.blocks.microimages
         sets = RaySets.of_lenses(rays) if self.ray_sets == 2 else RaySets.single(rays.size)
         if self._tiled is not None:
@@ -218,18 +212,14 @@ class Projector(RayProjector):
     def scatter(self, volume: Values, ray_set: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
         light = to_device(volume, float)
-        self._scatter(light if self._planes is None else self._planes.spread(light), ray_set)
-
-    def _scatter(self, light: wp.array, lenses: int) -> None:
-        """Do as `scatter` with the light of what `blocks` are of."""
         if self._tiled is not None:
-            self._tiled.scatter(light, lenses)
+            self._tiled.scatter(light, ray_set)
             return
         rays = to_host(self.rays)
 
         def scatter_part(part, first, last):
             rays[self._places[part] : self._places[part + 1]] = 0.0
-            inputs, outputs = [self._matrix, light, lenses, first], [self._parts[part]]
+            inputs, outputs = [self._matrix, light, ray_set, first], [self._parts[part]]
             wp.launch(_project, dim=last - first, inputs=inputs, outputs=outputs, device="cpu")
 
         runtime.run_chunks(light.size, scatter_part)
@@ -239,52 +229,33 @@ class Projector(RayProjector):
 
         Voxels whose `active`, shape (voxel,), float32, is zero do not change.
         """
-        volume, mask = to_device(out, float), None if active is None else to_device(active, float)
-        if self._planes is None:
-            self._gather(volume, mask, ray_set)
+        volume, device = to_device(out, float), runtime.device().warp
+        mask = voxels.ones(volume.size) if active is None else to_device(active, float)
+        if self._tiled is not None:
+            self._tiled.gather(volume, mask, ray_set)
         else:
-            if mask is not None and self._on_cpu and to_host(mask).all():
-                mask = None
-            lit = None if mask is None else self._planes.spread(voxels.indicator(mask), absolute=True)
-            found = self._planes.collect(self._gather(zeros(self._planes.shares.size), lit, ray_set))
-            voxels.add(found, volume, mask)
+
+            def gather_part(part, first, last):
+                inputs = [self._matrix, self._parts[part], mask, ray_set, first]
+                wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
+
+            runtime.run_chunks(volume.size, gather_part)
         overwrite(out, volume)
         return out
 
-    def _gather(self, volume: wp.array, active: wp.array | None, lenses: int) -> wp.array:
-        """Do as `gather` for what `blocks` are of."""
-        mask, device = voxels.ones(volume.size) if active is None else active, runtime.device().warp
-        if self._tiled is not None:
-            self._tiled.gather(volume, mask, lenses)
-            return volume
-
-        def gather_part(part, first, last):
-            inputs = [self._matrix, self._parts[part], mask, lenses, first]
-            wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
-
-        runtime.run_chunks(volume.size, gather_part)
-        return volume
-
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur several times."""
-        if self.planes is None:
-            return self.blocks.entries(voxel)
-        nodes, shares = self.planes.nodes_of(voxel)
-        rays, weights = zip(*(self.blocks.entries(int(node)) for node in nodes), strict=True)
-        return np.concatenate(rays), np.concatenate([own * share for own, share in zip(weights, shares, strict=True)])
+        return self.blocks.entries(voxel)
 
     def largest_weight(self) -> float:
         """Return the largest weight of a ray."""
         return self.blocks.largest_weight()
 
     def count_lit(self) -> np.ndarray:
-        """Count the rays that each voxel lights, shape (voxel,), int32. With planes: a weighted mean of its nodes'."""
+        """Count the rays that each voxel lights, shape (voxel,), int32."""
         share = self.blocks.microimages.share
         if self._tiled is not None:
-            count = self._tiled.count_lit(share)
-        else:
-            count = wp.zeros(len(self.blocks.scale), dtype=int, device="cpu")
-            launch(Call(_count_lit, len(count), [self._matrix, to_device(share, float)], [count]))
-        if self._planes is None:
-            return to_host(count)
-        return np.rint(np.maximum(self._planes.collect(to_host(count).astype(np.float32)), 0)).astype(np.int32)
+            return to_host(self._tiled.count_lit(share))
+        count = wp.zeros(len(self.blocks.scale), dtype=int, device="cpu")
+        launch(Call(_count_lit, len(count), [self._matrix, to_device(share, float)], [count]))
+        return to_host(count)

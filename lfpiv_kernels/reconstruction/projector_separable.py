@@ -124,7 +124,7 @@ class SeparableProjector(RayProjector):
 
     def __init__(self, weights: SeparableWeights, sets: int):
         super().__init__()
-        self.weights, self.ray_sets = weights, sets
+        self.weights, self.ray_sets, self.parts = weights, sets, (weights,)
         self.form, self.nbytes = weights.form, weights.nbytes
         self.rays = zeros(weights.ray_rows * weights.rays_of_row)
         self.returned = zeros(weights.ray_rows * weights.rays_of_row)

@@ -40,8 +40,15 @@ class RayProjector:
     """Whether sets of rays are rows of pixels under every lens, each of which sees the whole volume."""
     form: str
     """Form of the weights, "profiles" or "pixels"."""
+    parts: tuple[object, ...]
+    """The dataclasses that it was made from."""
     nbytes: int
     """Memory of the weights [byte]."""
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory of the weights on a GPU, and of what projects with them [byte]; 0 on the CPU."""
+        raise NotImplementedError
 
     def __init__(self) -> None:
         self._turn, self._reserved = threading.RLock(), False

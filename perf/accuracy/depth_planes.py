@@ -17,7 +17,7 @@ import reconstruction_ways
 from reconstruction_bench import CACHE, measure, parse_cases
 from reconstruction_ways import WAYS
 
-from lfpiv.weights import depth_planes
+from lfpiv.weights.forms import nodes as forms
 
 FIGURES = ("error", "q", "misfit", "cpu_s")
 
@@ -25,13 +25,13 @@ FIGURES = ("error", "q", "misfit", "cpu_s")
 @contextmanager
 def nodes(used: bool) -> Iterator[None]:
     """Use nodes for volumes of any size, or for none."""
-    before = depth_planes.FEWEST_VOXELS, depth_planes.LEAST_GAIN
-    depth_planes.FEWEST_VOXELS, depth_planes.LEAST_GAIN = (0, 0.0) if used else (10**18, 0.0)
+    before = forms.FEWEST_VOXELS, forms.LEAST_GAIN
+    forms.FEWEST_VOXELS, forms.LEAST_GAIN = (0, 0.0) if used else (10**18, 0.0)
     reconstruction_ways.forget_weights()
     try:
         yield
     finally:
-        depth_planes.FEWEST_VOXELS, depth_planes.LEAST_GAIN = before
+        forms.FEWEST_VOXELS, forms.LEAST_GAIN = before
         reconstruction_ways.forget_weights()
 
 

@@ -26,7 +26,7 @@ from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.reproduce import rigs
 from lfpiv.runs.guard import LEAST_LAYERS
 from lfpiv.settings.processing import Smart
-from lfpiv.weights.depth_planes import PARTICLE_VOXEL
+from lfpiv.weights.forms.image_errors import PARTICLE_VOXEL
 from lfpiv.weights.operator import Weights, build_weights
 
 _KEYS_SINCE = {"subsets": 1, "refinement": 1.0, "predict": False}

@@ -5,7 +5,7 @@ import pytest
 from support.ideal_rig import IdealCamera, lattice, optics, rotation
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.weights.separable_planes import Planes
+from lfpiv.weights.forms.camera_profiles import CameraProfiles
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import reference
 from lfpiv_kernels.reconstruction import projector_separable, separable_gpu
@@ -32,7 +32,7 @@ def made(name):
     grid = Grid.from_extent(centre_mm=(0.1, 0.0, -0.05), size_mm=[0.13 * n for n in shape[::-1]], voxel_mm=0.13)
     camera = IdealCamera("one", pose, optics(140, 160), lattice(roll_deg=roll_deg))
     stored = StoredGrid.for_cameras(grid, [camera], columns_inmost=name != "columns apart in memory")
-    planes = Planes(stored, camera)
+    planes = CameraProfiles(stored, camera)
     assert planes.possible
     return planes, planes.weights(lambda part: None)
 

@@ -36,7 +36,7 @@ wp.array.__init__ = counted
 import numpy as np
 
 import lfpiv
-from lfpiv.weights.device_share import BASE_BYTES, beside_bytes
+from lfpiv.weights.memory_left import BASE_BYTES, beside_bytes
 from lfpiv_kernels import runtime
 
 assert runtime.start("cpu").form == "gpu"

@@ -18,7 +18,7 @@ from lfpiv.report.summary import DeviceFigures
 from lfpiv.results import netcdf
 from lfpiv.runs import device_memory, memory
 from lfpiv.runs.memory import GIB
-from lfpiv.weights.device_share import rays_bytes
+from lfpiv.weights.memory_left import rays_bytes
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import Device
 

@@ -17,7 +17,7 @@ from lfpiv.runs import memory
 from lfpiv.runs.memory import GIB
 from lfpiv.settings.particles import Series
 from lfpiv.weights import separable
-from lfpiv.weights.separable import ray_sets
+from lfpiv.weights.forms.shared_profiles import ray_sets
 from lfpiv_kernels import runtime
 
 LEAST_KEPT = 0.9

@@ -16,8 +16,8 @@ from lfpiv.errors import InputError
 from lfpiv.runs import pipeline
 from lfpiv.settings.processing import Compute
 from lfpiv.weights import counted_grid
-from lfpiv.weights.counted_grid import counter_of
 from lfpiv.weights.counting import count_voxels
+from lfpiv.weights.forms.counted import counter_of
 from lfpiv.weights.ray_fit import ray_models
 from lfpiv_kernels import reference, runtime
 from lfpiv_kernels.rays import counted_blocks
@@ -168,7 +168,7 @@ BUSY_THREADS = """
 from pathlib import Path
 import numpy as np
 from support.ideal_rig import IdealCamera, rotation
-from lfpiv.weights.counted_grid import counter_of
+from lfpiv.weights.forms.counted import counter_of
 from lfpiv.weights.ray_fit import ray_models
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rays import counted_blocks

@@ -8,24 +8,18 @@ from scipy import ndimage
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv.weights import depth_planes, separable
 from lfpiv.weights.checks import compare_with_count, estimate_memory
-from lfpiv.weights.depth_planes import (
-    PARTICLE_ERROR,
-    PARTICLE_VOXEL,
-    VOXEL_ERROR,
-    NodeGrid,
-    Sample,
-    blobs_about,
-    choose_planes,
-    interpolation_errors,
-    line_of_sight,
-)
-from lfpiv.weights.line_shares import BEFORE, LINES, VARIANCE_VOXEL, line_shares
+from lfpiv.weights.forms import nodes as nodes_form
+from lfpiv.weights.forms import shared_profiles
+from lfpiv.weights.forms.image_errors import PARTICLE_ERROR, PARTICLE_VOXEL, Sample, blobs_about
+from lfpiv.weights.forms.line_shares import BEFORE, LINES, VARIANCE_VOXEL, line_shares
+from lfpiv.weights.forms.node_grid import NodeGrid, line_of_sight
+from lfpiv.weights.forms.nodes import VOXEL_ERROR, choose_nodes, interpolation_errors
 from lfpiv.weights.ray_fit import ray_models
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
+from lfpiv_kernels.reconstruction.node_projector import NodeProjector
 from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
@@ -46,15 +40,15 @@ BETWEEN = {"30": rotation(30), "-60, rolled": rotation(-60, 0.5, 3), "35 and 20"
 def without_shared_profiles():
     """Do not let planes share profiles, which would serve these rigs, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(separable, "FEWEST_VOXELS", np.inf)
+        patch.setattr(shared_profiles, "FEWEST_VOXELS", np.inf)
         yield
 
 
 @pytest.fixture
 def for_small_volumes(monkeypatch):
     """Use nodes however small the volume and the gain are."""
-    monkeypatch.setattr(depth_planes, "FEWEST_VOXELS", 0)
-    monkeypatch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+    monkeypatch.setattr(nodes_form, "FEWEST_VOXELS", 0)
+    monkeypatch.setattr(nodes_form, "LEAST_GAIN", 0.0)
 
 
 def rig_of(*yaws_deg):
@@ -65,8 +59,8 @@ def rig_of(*yaws_deg):
 def between(device):
     """Return the weights of cameras at 30 and -60 degrees with nodes and those of all voxels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(depth_planes, "FEWEST_VOXELS", 0)
-        patch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+        patch.setattr(nodes_form, "FEWEST_VOXELS", 0)
+        patch.setattr(nodes_form, "LEAST_GAIN", 0.0)
         nodes = lfpiv.build_weights(rig_of(30, -60), GRID, particle_voxel=PARTICLE_VOXEL)
     return nodes, lfpiv.build_weights(rig_of(30, -60), GRID, planes=False)
 
@@ -75,8 +69,8 @@ def between(device):
 def both(device):
     """Return the weights of two cameras with nodes and those of all voxels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(depth_planes, "FEWEST_VOXELS", 0)
-        patch.setattr(depth_planes, "LEAST_GAIN", 0.0)
+        patch.setattr(nodes_form, "FEWEST_VOXELS", 0)
+        patch.setattr(nodes_form, "LEAST_GAIN", 0.0)
         nodes = lfpiv.build_weights(two_cameras(), GRID)
     return nodes, lfpiv.build_weights(two_cameras(), GRID, planes=False)
 
@@ -171,7 +165,7 @@ def test_models_of_nodes_are_those_of_their_places(pose, order):
 def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
     camera = IdealCamera("one", pose, lattice=lattice(roll_deg=0.5))
     stored = StoredGrid.for_cameras(GRID, [camera])
-    nodes = choose_planes(stored, camera, "pixels")
+    nodes = choose_nodes(stored, camera, "pixels")
     voxels = np.random.default_rng(2).choice(stored.size, 40)
     sample = Sample(camera, voxels[:, None], np.ones((40, 1)), "pixels")
     own = sample.own_images(stored)
@@ -183,7 +177,7 @@ def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
 
 def test_operator_with_nodes_is_that_of_all_voxels(both):
     nodes, every = both
-    assert all(nodes.projector(name).planes is not None for name in nodes.cameras)
+    assert all(isinstance(nodes.projector(name), NodeProjector) for name in nodes.cameras)
     assert nodes.memory_bytes < 0.7 * every.memory_bytes
     rng = np.random.default_rng(3)
     sparse = np.zeros(GRID.shape, np.float32)
@@ -206,7 +200,7 @@ def test_operator_with_nodes_is_that_of_all_voxels(both):
 
 def test_operator_with_lines_of_sight_is_that_of_all_voxels(between):
     nodes, every = between
-    assert all(nodes.projector(name).planes.column_share.shape[1] == LINES for name in nodes.cameras)
+    assert all(nodes.projector(name).shares.column_share.shape[1] == LINES for name in nodes.cameras)
     rng = np.random.default_rng(9)
     sparse = np.zeros(GRID.shape, np.float32)
     sparse[tuple(rng.integers(0, n, 40) for n in GRID.shape)] = 1.0
@@ -281,12 +275,12 @@ def test_volumes_are_as_good_as_with_the_weights_of_all_voxels(weights, request)
 
 
 def test_memory_with_nodes_is_estimated(monkeypatch):
-    monkeypatch.setattr(separable, "are_possible", lambda *_: False)  # they would be stored in place of nodes
+    monkeypatch.setattr(shared_profiles, "are_possible", lambda *_: False)  # they would be stored in place of nodes
     rig = two_cameras(optics=optics(rows=60, columns=80))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.4, 2.4, 2.4), voxel_mm=0.05)
     nothing = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=0.05, first_centre_mm=(0.0, 50.0, 0.0))
     weights = lfpiv.build_weights(rig, grid, form="profiles")
-    assert all(weights.projector(name).planes is not None for name in weights.cameras)
+    assert all(isinstance(weights.projector(name), NodeProjector) for name in weights.cameras)
     estimate = estimate_memory(rig, grid, "profiles") - estimate_memory(rig, nothing, "profiles")
     assert estimate == pytest.approx(weights.memory_bytes, rel=0.1)
 
@@ -304,7 +298,7 @@ def test_memory_with_nodes_is_estimated(monkeypatch):
 def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(pose, lines, for_small_volumes):
     camera = IdealCamera("one", pose)
     stored = StoredGrid.for_cameras(GRID, [camera])
-    nodes = choose_planes(stored, camera, "profiles", particle_voxel=PARTICLE_VOXEL)
+    nodes = choose_nodes(stored, camera, "profiles", particle_voxel=PARTICLE_VOXEL)
     sample = Sample(camera, *blobs_about(stored, np.random.default_rng(10).choice(stored.size, 12)), "profiles")
     error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, sample, sample.own_images(stored)))))
     assert nodes.lines == lines and error < 1.4 * PARTICLE_ERROR  # of other particles than those by which it was chosen
@@ -313,7 +307,7 @@ def test_cameras_between_lattice_directions_share_voxels_among_lines_of_sight(po
 def test_planes_lie_farther_apart_for_particles_than_for_points(for_small_volumes):
     camera = IdealCamera("one", rotation(45))
     stored = StoredGrid.for_cameras(GRID, [camera])
-    points, particles = (choose_planes(stored, camera, "profiles", particle_voxel=size) for size in (0, PARTICLE_VOXEL))
+    points, particles = (choose_nodes(stored, camera, "profiles", particle_voxel=size) for size in (0, PARTICLE_VOXEL))
     assert particles.distance > points.distance and particles.size < points.size
 
 
@@ -327,13 +321,13 @@ def test_counted_rays_are_compared_with_the_voxels_own_footprints_where_nodes_se
 def test_voxels_are_not_shared_among_lines_of_sight_for_small_particles(for_small_volumes):
     camera = IdealCamera("one", rotation(33))
     stored = StoredGrid.for_cameras(GRID, [camera])
-    assert choose_planes(stored, camera, "profiles", particle_voxel=0.6) is None
+    assert choose_nodes(stored, camera, "profiles", particle_voxel=0.6) is None
 
 
 def test_small_volumes_and_cameras_that_see_nothing_store_all_voxels():
     camera = IdealCamera("one", rotation(45))
-    assert choose_planes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
+    assert choose_nodes(StoredGrid.for_cameras(GRID, [camera]), camera, "profiles") is None
     far = lfpiv.Grid(shape=(50, 50, 50), voxel_mm=0.05, first_centre_mm=(0.0, 500.0, 0.0))
-    assert choose_planes(StoredGrid.for_cameras(far, [camera]), camera, "profiles") is None
+    assert choose_nodes(StoredGrid.for_cameras(far, [camera]), camera, "profiles") is None
     weights = lfpiv.build_weights(IdealRig({"one": camera}), GRID)
-    assert weights.projector("one").planes is None
+    assert not isinstance(weights.projector("one"), NodeProjector)

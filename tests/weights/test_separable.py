@@ -14,12 +14,21 @@ from lfpiv.lightfield.microimage_layout import microimage_centres
 from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.weights import separable
 from lfpiv.weights.checks import compare_with_count, estimate_device_need, estimate_memory
-from lfpiv.weights.depth_planes import PARTICLE_ERROR, WORST_PARTICLE_ERROR, Sample, blobs_about
-from lfpiv.weights.device_share import DeviceShare, beside_bytes
-from lfpiv.weights.separable import choose_separable, particle_errors, possible_planes, ray_sets
-from lfpiv.weights.separable_planes import Planes
+from lfpiv.weights.choice import Choice
+from lfpiv.weights.counting import draw_seen
+from lfpiv.weights.forms.camera_profiles import CameraProfiles
+from lfpiv.weights.forms.form import Rig
+from lfpiv.weights.forms.image_errors import (
+    PARTICLE_ERROR,
+    PARTICLES,
+    SEEDS,
+    WORST_PARTICLE_ERROR,
+    Sample,
+    blobs_about,
+)
+from lfpiv.weights.forms.shared_profiles import SharedProfiles, particle_errors, ray_sets
+from lfpiv.weights.memory_left import MemoryLeft, beside_bytes
 from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels import runtime
@@ -42,8 +51,11 @@ def camera(name="one", yaw_deg=45.0, roll_deg=0.0, layout="square"):
     return IdealCamera(name, rotation(yaw_deg, 0.2), optics(260, 280, layout), lattice(layout, roll_deg))
 
 
-def share_of(cameras):
-    return DeviceShare(cameras.values(), GRID)
+def profiles_of(cameras, limit_bytes=np.inf):
+    """Return shared profiles of cameras whose footprints are products of profiles."""
+    stored, memory = StoredGrid.for_cameras(GRID, cameras.values()), MemoryLeft(cameras.values(), GRID, limit_bytes)
+    choices = {name: Choice(form="profiles") for name in cameras}
+    return SharedProfiles(Rig(stored=stored, cameras=cameras, memory=memory, choices=choices), cameras)
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +84,11 @@ def test_profiles_are_shared_where_rows_of_lenses_are_level(both):
 def test_profiles_are_not_shared_where_one_camera_does_not_suit(cameras, device):
     rig = rig_of(*cameras)
     assert not lfpiv.build_weights(rig, GRID).has_ray_rows
-    stored = StoredGrid.for_cameras(GRID, rig.cameras.values(), columns_inmost=True)
-    assert choose_separable(stored, rig.cameras, share_of(rig.cameras), np.inf, lambda part: None) is None
+    assert not profiles_of(rig.cameras).build(lambda name: lambda part: None)
 
 
 def test_profiles_are_not_shared_beyond_the_memory_that_is_left(both):
-    cameras = both[0].cameras
-    stored = StoredGrid.for_cameras(GRID, cameras.values(), columns_inmost=True)
-    assert choose_separable(stored, cameras, share_of(cameras), 1e6, lambda part: None) is None
+    assert profiles_of(both[0].cameras).suits and not profiles_of(both[0].cameras, 1e6).suits
 
 
 def test_profiles_are_shared_only_where_a_gpu_holds_them(both, tmp_path, monkeypatch):
@@ -87,12 +96,12 @@ def test_profiles_are_shared_only_where_a_gpu_holds_them(both, tmp_path, monkeyp
     cameras = shared.cameras
     rig, beside = rig_of(*cameras.values()), beside_bytes(cameras.values(), GRID)
     need = estimate_device_need(rig, GRID)
-    planes = [Planes(shared.stored, one) for one in cameras.values()]
+    planes = [CameraProfiles(shared.stored, one) for one in cameras.values()]
     assert need.beside == beside and need.cameras == pytest.approx([one.device_bytes for one in planes], rel=0.05)
     monkeypatch.setattr(runtime, "free_bytes", lambda: need.whole)
-    assert possible_planes(shared.stored, cameras, share_of(cameras)).keys() == cameras.keys()
+    assert profiles_of(cameras).suits == tuple(cameras)
     monkeypatch.setattr(runtime, "free_bytes", lambda: need.whole - 20 * MIB)
-    assert possible_planes(shared.stored, cameras, share_of(cameras)) is None
+    assert not profiles_of(cameras).suits
     assert estimate_device_need(rig, GRID).cameras != need.cameras
     content = save_weights(shared, tmp_path / "weights")
     monkeypatch.setattr(runtime, "free_bytes", lambda: beside + sum(need.cameras) // 4)
@@ -105,7 +114,7 @@ def test_memory_of_a_gpu_is_estimated(both):
     if runtime.device().form != "gpu":
         pytest.skip("the arrays of the CPU are those of the host")
     for name, camera in shared.cameras.items():
-        estimate = Planes(shared.stored, camera).device_bytes
+        estimate = CameraProfiles(shared.stored, camera).device_bytes
         found = shared.projector(name).device_bytes
         assert (1 - TOLERANCE_ESTIMATE) * found < estimate < 1.5 * found  # levels that are 0 are left out
 
@@ -134,10 +143,8 @@ def test_errors_of_particles_are_those_of_a_plain_comparison(both):
     shared = both[0]
     name, stored = "two", shared.stored
     errors = particle_errors(stored, shared.cameras[name], shared.projector(name))
-    seen = np.unique(
-        np.concatenate([separable.draw_seen(stored, shared.cameras[name], seed) for seed in separable.SEEDS])
-    )
-    voxels, light = blobs_about(stored, seen[:: len(seen) // separable.PARTICLES + 1])
+    seen = np.unique(np.concatenate([draw_seen(stored, shared.cameras[name], seed) for seed in SEEDS]))
+    voxels, light = blobs_about(stored, seen[:: len(seen) // PARTICLES + 1])
     sample = Sample(shared.cameras[name], voxels, light, "profiles")
     assert len(errors) == len(voxels) == sum(one.shape[0] for one in sample.own_images(stored))
     volume = np.zeros(stored.size, np.float32)
@@ -212,7 +219,7 @@ def test_memory_is_estimated(both):
     shared = both[0]
     rays = sum(8 * one.rays.size + one.weights.pixel.nbytes for one in map(shared.projector, shared.cameras))
     estimate = estimate_memory(rig_of(*shared.cameras.values()), GRID)
-    planes = [Planes(shared.stored, one) for one in shared.cameras.values()]
+    planes = [CameraProfiles(shared.stored, one) for one in shared.cameras.values()]
     assert sum(one.stored_bytes for one in planes) == pytest.approx(shared.memory_bytes, rel=TOLERANCE_ESTIMATE)
     assert estimate > shared.memory_bytes + rays
 
@@ -246,7 +253,7 @@ def test_profiles_serve_up_to_the_edges_of_the_sensor(yaw_deg, pitch_deg, roll_d
     seen = IdealCamera("one", rotation(yaw_deg, pitch_deg, roll_deg), optics(420, 460), lattice(roll_deg=0.05))
     grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.6, 2.6, 2.6), voxel_mm=0.074)
     stored = StoredGrid.for_cameras(grid, [seen], columns_inmost=True)
-    weights = Planes(stored, seen).weights(lambda part: None)
+    weights = CameraProfiles(stored, seen).weights(lambda part: None)
     rows = microimage_centres(seen.optics, seen.lattice, 0)[1].shape[0]
     assert 0 < rows % STRIP < 12
     errors = particle_errors(stored, seen, SeparableProjector(weights, 8))

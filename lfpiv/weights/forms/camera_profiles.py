@@ -1,7 +1,7 @@
 """Profiles that planes of voxels share, of one camera: the axes, the lenses and the ray models that they are made of.
 
 A plane has rows and columns of voxels, along the rows and columns of the sensor. The output is `SeparableWeights`, see
-there and `lfpiv_kernels.weights.separable`. `lfpiv.weights.separable` chooses where they are used.
+there and `lfpiv_kernels.weights.separable`. `lfpiv.weights.forms.shared_profiles` chooses where they are used.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def camera_axes(stored: StoredGrid, camera: CalibratedCamera) -> tuple[int, int,
 
 
 @dataclass(frozen=True)
-class Planes:
+class CameraProfiles:
     """The planes of a volume as one camera sees them, and their profiles."""
 
     stored: StoredGrid

@@ -1,13 +1,13 @@
-"""Weights of a whole grid by counting rays (Eq. 10), as blocks of 8-bit levels.
+"""Weights of each voxel by counting rays (Eq. 10), as blocks of 8-bit levels.
 
 Every voxel is counted by ``lfpiv_kernels.rays.counted_blocks`` in batches of planes, whose blocks are joined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from lfpiv.lightfield.microimage_layout import whole_microimages
 from lfpiv.progress import StepProgress
 from lfpiv.weights.blocks import BLOCK_BYTES, SAMPLED_VOXELS, VOXEL_BYTES, Growing, PackedCamera, require_numbers
+from lfpiv.weights.forms.voxels import Voxels
 from lfpiv.weights.ray_fit import ray_models
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.rays.counted_blocks import CountedBlocks
@@ -31,6 +32,19 @@ NAMES = ("blocks", "values", "even_blocks", "even_values", "scale", "ray", "heig
 """Arrays of a batch, as `CountedBlocks.compute` yields them."""
 
 Batch = dict[str, np.ndarray]
+
+
+class Counted(Voxels):
+    """Weights of each voxel by counted rays. They suit all cameras where rays are to be counted."""
+
+    @property
+    def suits(self) -> Sequence[str]:
+        """All cameras or none."""
+        return self.names if self.rig.rays else ()
+
+    def _build_parts(self, name: str, progress: StepProgress, allow: Callable[[int], None]) -> tuple[Any, ...]:
+        """Count the weights of a camera."""
+        return (count_blocks(self.stored, self.rig.cameras[name], self.rig.rays, progress, allow),)
 
 
 def counter_of(camera: CalibratedCamera, rays: int) -> tuple[CountedBlocks, Microimages]:

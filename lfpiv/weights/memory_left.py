@@ -1,4 +1,4 @@
-"""Memory of a GPU: what volumes, images and correlation take of it, and what is left for the weights.
+"""Memory that is left for the weights, and what volumes, images and correlation take of a GPU.
 
 A GPU holds the weights of all cameras; the volumes that SMART works on, and the images;
 then the volumes, the spline coefficients and a batch of windows of the correlation.
@@ -7,23 +7,21 @@ then the volumes, the spline coefficients and a batch of windows of the correlat
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.files import MIB, size_text
 from lfpiv.geometry.grid import Grid
 from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction import projector_gpu
-from lfpiv_kernels.reconstruction.depth_planes import PlaneShares
-from lfpiv_kernels.reconstruction.projector import Blocks, Projector
-from lfpiv_kernels.reconstruction.projector_separable import SeparableProjector
-from lfpiv_kernels.reconstruction.separable_gpu import device_bytes
-from lfpiv_kernels.reconstruction.separable_weights import PARTS, SeparableWeights
+from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.weights.choice import Choice
 
 VOLUMES, VOLUMES_PER_CAMERA = 10, 4
 """Largest number of volumes that SMART has on the GPU at once: coefficients, light, exponent, momentum, their sums and
@@ -68,8 +66,8 @@ def beside_bytes(cameras: Collection[CalibratedCamera], grid: Grid) -> int:
     return BASE_BYTES + sum(map(rays_bytes, cameras)) + max(smart, BATCH_BYTES + CORRELATED_BYTES * grid.size)
 
 
-class DeviceShare:
-    """Free memory of the running GPU for the weights of a grid. The cameras take of it one after the other.
+class MemoryLeft:
+    """Memory that is left for the weights of a grid, on the host and on the running GPU.
 
     Parameters
     ----------
@@ -77,48 +75,44 @@ class DeviceShare:
         All cameras of the grid.
     grid : Grid
         The voxels.
+    limit_bytes : float
+        Memory that the weights may take on the host [byte]; default: no limit.
     """
 
-    def __init__(self, cameras: Collection[CalibratedCamera], grid: Grid):
+    def __init__(self, cameras: Collection[CalibratedCamera], grid: Grid, limit_bytes: float = math.inf):
         free = runtime.free_bytes()
-        self._left = None if free is None else free - beside_bytes(cameras, grid)
+        self._host, self._shape = limit_bytes, grid.shape
+        self._device = None if free is None else free - beside_bytes(cameras, grid)
 
-    def holds(self, sizes: Iterable[int]) -> bool:
-        """Return whether the weights of all cameras [byte] fit; those of the CPU always do."""
-        return self._left is None or sum(sizes) <= self._left
+    def holds(self, host: int, device: int) -> bool:
+        """Return whether weights of some sizes fit [byte]; those of the CPU need no memory of a device."""
+        return host <= self._host and (self._device is None or device <= self._device)
 
-    def separable(self, name: str, weights: SeparableWeights, sets: int) -> SeparableProjector:
-        """Make the projector of the next camera from profiles of planes; exceptions as of `projector`."""
-        _, planes, columns = weights.shape
-        lines, rays = (planes * weights.strips, columns), weights.ray_rows * weights.rays_of_row
-        self._require(name, device_bytes(weights.nbytes, weights.level.size // PARTS, lines, rays, weights.ray_rows))
-        projector = SeparableProjector(weights, sets)
-        self._take(projector.device_bytes)
-        return projector
+    def require(self, name: str, choice: Choice, host: int) -> None:
+        """Raise InputError if the weights of a camera do not fit on the host [byte]."""
+        if host <= self._host:
+            return
+        voxels, other = " x ".join(map(str, self._shape)), ""
+        if choice.profile_errors and choice.form == "pixels":
+            percent = 100 * np.mean(choice.profile_errors)
+            other = f", or set compute.weights_form to 'profiles', {percent:.0f} % from counted rays here"
+        raise InputError(
+            f"volume: the weights of {voxels} voxels (z, y, x) on camera {name!r} need {host / 2**30:.1f} GiB as "
+            f"{choice.form}, {max(self._host, 0) / 2**30:.1f} GiB are left. Raise volume.voxel_mm, shrink "
+            f"volume.size_mm{other}."
+        )
 
-    def projector(self, name: str, blocks: Blocks, planes: PlaneShares | None = None) -> Projector:
-        """Make the projector of the next camera.
-
-        Raises
-        ------
-        InputError
-            If the weights do not fit into the memory that is left.
-        """
-        counts, edge = (len(blocks.scale), len(blocks.ray), len(blocks.value)), blocks.microimages.edge
-        self._require(name, projector_gpu.device_bytes(blocks.form, *counts, edge=edge), projector_gpu.MOST_BYTES)
-        projector = Projector(blocks, planes)
-        self._take(projector.device_bytes)
-        return projector
-
-    def _require(self, name: str, size: int, most: float = math.inf) -> None:
-        """Refuse weights of a camera [byte] that do not fit."""
-        if self._left is not None and size > (left := min(self._left, most)):
+    def require_device(self, name: str, size: int, most: float = math.inf) -> None:
+        """Raise InputError if the weights of a camera do not fit into the GPU [byte], or are more than `most`."""
+        if self._device is not None and size > (left := min(self._device, most)):
             raise InputError(
                 f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
                 f"{size_text(max(left, 0))} are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers "
                 "per GPU, or --device cpu."
             )
 
-    def _take(self, size: int) -> None:
-        if self._left is not None:
-            self._left -= size
+    def take(self, projector: RayProjector) -> None:
+        """Count the memory of built weights as taken."""
+        self._host -= projector.nbytes
+        if self._device is not None:
+            self._device -= projector.device_bytes
