@@ -9,7 +9,7 @@ The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E
 it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
 places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
 which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark ones stay
-dark. A step by a part of the rays follows (`Normalisation.correcting`).
+dark. A step by a part of the rays follows (`RowSubsets.correcting`).
 
 .. [1] K. P. Lynch, F. Scarano, "An efficient and accurate approach to MTE-MART for time-resolved tomographic PIV", Exp.
    Fluids 56 (2015) 66, doi:10.1007/s00348-015-1934-6.

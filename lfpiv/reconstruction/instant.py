@@ -14,8 +14,8 @@ from lfpiv.reconstruction.dark_voxels import DARK
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import POINT_PASSES, WHOLE_PASSES, Epoch, Partition, Subset, iterate_epochs
+from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
+from lfpiv.reconstruction.ordered_subsets import Epoch, Partition, Subset, iterate_epochs
 from lfpiv.reconstruction.recording import Recording
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
@@ -34,7 +34,7 @@ class PreparedInstant:
     stored: StoredGrid
     settings: SmartSettings
     recordings: Mapping[str, Recording]
-    normalisation: Normalisation
+    normalisation: LensSubsets | RowSubsets
     intensity_cap: float
     solid: np.ndarray | None
     """True for voxels without fluid, shape (z, y, x); None without a mask."""
@@ -53,8 +53,7 @@ class PreparedInstant:
     ) -> Reconstruction:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
-        `whole_passes` is the number of passes over all rays after those over subsets; default: `WHOLE_PASSES`, or
-        `POINT_PASSES` after subsets of all cameras without a sieve, at most half of all passes. A
+        `whole_passes` is the number of passes over all rays after those over subsets; default: that of the subsets. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
         misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN.
         """
@@ -62,25 +61,21 @@ class PreparedInstant:
         state = self._start(duplicate(self._from_images) if first is None else self._given(first))
         count = settings.iterations if iterations is None else iterations
         history = History(settings, count)
-        if whole_passes is None:
-            points = normalisation.is_joint and normalisation.sieve.sigma_voxel == 0
-            whole_passes = min(POINT_PASSES if points else WHOLE_PASSES, -(-count // 2))
-        possible = max(count - whole_passes, 0) if normalisation.has_subsets else 0
-        partitions = normalisation.partitions if possible else ()
-        epochs = min(possible, partitions[0].most_epochs) if possible and normalisation.is_joint else possible
-        rose = False
+        epochs, whole_passes = normalisation.passes(count, whole_passes)
+        partitions = normalisation.partitions if epochs else ()
+        sieve, rose = normalisation.sieve, False
         with self.equations.locked():
             if partitions:
                 if not brief:  # exact, as all steps begin here
-                    history.append(self.equations.compare(normalisation.sieve(state.coefficients)))
-                made = iterate_epochs(self.equations, state, normalisation.sieve, partitions=partitions, epochs=epochs)
+                    history.append(self.equations.compare(sieve(state.coefficients)))
+                made = iterate_epochs(self.equations, state, sieve, partitions=partitions, epochs=epochs)
                 state, rose = _run_epochs(made, state, history, progress)
             left = count - history.epochs
-            enough = normalisation.is_joint and history.epochs < possible and not rose
+            enough = normalisation.suffice and left > whole_passes and not rose
             if enough:
-                left = min(left, whole_passes)
+                left = whole_passes
             if brief and left == 0:
-                volume, stop = normalisation.sieve(state.coefficients), None
+                volume, stop = sieve(state.coefficients), None
                 history.append(Misfit(math.nan, math.nan))
             else:
                 volume, stop = self._solve_whole(state, history, left, progress)
@@ -100,7 +95,7 @@ class PreparedInstant:
         """Reconstruct the instant from a first guess that shows already where particles are, by subsets of the rays.
 
         No pass over all rays follows. Misfits are those of the subsets before each step, scaled to the light of all
-        rays. After the last step it is that of `Normalisation.sample`, scaled likewise. Without a sieve voxels
+        rays. After the last step it is that of `RowSubsets.sample`, scaled likewise. Without a sieve voxels
         that become dark are left out.
 
         Parameters
@@ -163,7 +158,7 @@ class PreparedInstant:
     def guess(self) -> Reconstruction:
         """Return a first guess from the images alone, without iterations.
 
-        It takes the rays of `Normalisation.correcting`, and so less time than the guess that `solve` starts from.
+        It takes the rays of `RowSubsets.part`, and so less time than the guess that `solve` starts from.
         """
         history = History(self.settings, 0)
         history.append(Misfit(math.nan, math.nan))
@@ -172,7 +167,7 @@ class PreparedInstant:
     def sampled_misfit(self, first: np.ndarray | None = None) -> float:
         """Return the misfit of a first guess (z, y, x) in a part of the rays [counts]; raise ValueError as `solve`.
 
-        It is scaled to the light of all rays. The part is `Normalisation.sample`, or all. Default: that of `guess`.
+        It is scaled to the light of all rays. The part is `RowSubsets.sample`, or all. Default: that of `guess`.
         """
         guess = self._from_part if first is None else self._given(first)
         with self.equations.locked():
@@ -192,7 +187,7 @@ class PreparedInstant:
 
     @cached_property
     def _sampled_part(self) -> tuple[float, float]:
-        """`_part_of_light` of `Normalisation.sample`."""
+        """`_part_of_light` of `RowSubsets.sample`."""
         return self._part_of_light(self.normalisation.sample)
 
     def _part_of_light(self, subsets: Sequence[Subset]) -> tuple[float, float]:
@@ -220,11 +215,9 @@ class PreparedInstant:
 
     @cached_property
     def _from_part(self) -> DeviceArray:
-        """First guess by the rays of `Normalisation.correcting`, in stored order, on the device."""
-        normalisation = self.normalisation
-        if not normalisation.is_joint:
-            return self._from_images
-        return self._guessed(normalisation.correcting.subsets[0], normalisation.correcting_sum)
+        """First guess by the rays of `RowSubsets.part`, in stored order, on the device."""
+        part = self.normalisation.part
+        return self._from_images if part is None else self._guessed(*part)
 
     def _guessed(self, subset: Subset | None = None, sums: DeviceArray | None = None) -> DeviceArray:
         """Return `multiplicative_guess` of the images by all rays, or by a subset with its sums of weights."""

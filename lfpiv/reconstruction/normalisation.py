@@ -13,13 +13,17 @@ import numpy as np
 
 from lfpiv.reconstruction.ordered_subsets import (
     CONFLICT,
+    FOLLOWING_TIME,
     JOINT_CONFLICT,
     POINT_CONFLICT,
+    POINT_PASSES,
+    WHOLE_PASSES,
     Partition,
     Subset,
     correcting_subset,
     step_sizes,
     subsets_of,
+    whole_subset,
 )
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
@@ -84,19 +88,6 @@ class Normalisation:
         """Whether the rays are divided into subsets."""
         return len(self._subsets) > 1
 
-    @property
-    def sample(self) -> tuple[Subset, ...]:
-        """Subsets by which guesses are compared: of each camera one, or some of all cameras. None without subsets."""
-        if self.is_joint:
-            return self._subsets[: -(-len(self._subsets) // COMPARED)]
-        return tuple(subset for subset in self._subsets if subset.parts[0][1] != 1) if self.has_subsets else ()
-
-    @property
-    def is_joint(self) -> bool:
-        """Whether each subset has rays of all cameras."""
-        cameras = [camera for camera, _ in self._subsets[0].parts] if self.has_subsets else []
-        return self._weights.has_ray_rows and len(set(cameras)) == len(self._weights.cameras)
-
     @cached_property
     def gains(self) -> dict[str, DeviceArray]:
         """Camera name -> counts that a pixel records per unit of light, of the pixels that voxels light, float32."""
@@ -130,65 +121,51 @@ class Normalisation:
         sharpened = self._settings.accelerate and self.sieve.sigma_voxel > 0
         return (SharpenedStep(unblurred, self.sieve), plain) if sharpened else (plain,)
 
+    def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
+        return to_device(np.divide(numerator, denominator, out=np.zeros_like(self._column_sum), where=where), float)
+
+
+class LensSubsets(Normalisation):
+    """Subsets of one camera each: all its lenses or half of them; or one subset of all rays."""
+
+    suffice = False
+    """Whether passes that are left when the subsets contradict each other are left out."""
+    part: tuple[Subset, DeviceArray] | None = None
+    """Rays by which instants are compared quickly, and the sum of each voxel's weights over them; None for all."""
+
+    @property
+    def sample(self) -> tuple[Subset, ...]:
+        """Subsets by which guesses are compared: one of each camera. None without subsets."""
+        return tuple(subset for subset in self._subsets if subset.parts[0][1] != 1) if self.has_subsets else ()
+
     @cached_property
     def partitions(self) -> tuple[Partition, ...]:
         """The subsets to begin with, and the whole cameras that may follow if "auto" began with halves."""
-        if self.is_joint:
-            return (self._joint_partition(self._subsets),)
         cameras = len(self._weights.cameras)
         may_grow = self._settings.subsets == AUTO and len(self._subsets) > cameras
         in_turn = (self._subsets, subsets_of(cameras)) if may_grow else (self._subsets,)
         last = in_turn[-1]
         return tuple(self._partition(subsets, 0.0 if subsets is last else CONFLICT) for subsets in in_turn)
 
-    @cached_property
+    @property
     def followed(self) -> tuple[Partition, ...]:
-        """The subsets by which an instant is reconstructed from the volume of the one before.
-
-        Without a sieve the first `FOLLOWED_STEPS` of subsets of all cameras.
-        """
-        if self.is_joint and self.sieve.sigma_voxel == 0:
-            return (self.partitions[0].part(slice(FOLLOWED_STEPS)),)
+        """The subsets by which an instant is reconstructed from the volume of the one before."""
         return self.partitions
+
+    @property
+    def following_time(self) -> float:
+        """Nesterov's time at which the momentum begins there."""
+        return FOLLOWING_TIME if self.sieve.sigma_voxel > 0 else 1.0
 
     @cached_property
     def correcting(self) -> Partition:
-        """The subset by which an instant is corrected after its comparison with those beside it.
+        """The subset by which an instant is corrected after its comparison with those beside it: all rays."""
+        return Partition((whole_subset(len(self._weights.cameras)),), self.steps[:1])
 
-        It has some ray rows of all cameras, see `correcting_subset`, or all rays where rows are not told apart.
-        """
-        cameras = len(self._weights.cameras)
-        if not self.is_joint:
-            every = Subset(tuple((camera, ALL) for camera in range(cameras)))
-            return Partition((every,), self.steps[:1])
-        rows = min(self._weights.projector(name).ray_sets for name in self._weights.cameras)
-        parts, chosen = correcting_subset(cameras, rows)
-        return self._joint_partition(parts).part(slice(chosen, chosen + 1))
-
-    @cached_property
-    def correcting_sum(self) -> DeviceArray:
-        """Sum of the weights of each voxel over the rays of `correcting`, shape (voxel,), float32.
-
-        It is at least `LEAST_PART` of the sum over all rays.
-        """
-        (subset,), total = self.correcting.subsets, np.zeros_like(self._column_sum)
-        for camera, name in enumerate(self._weights.cameras):
-            gain = self._weights.gain(name) * self._camera_gains[camera]
-            self._weights.projector(name).back_project(gain, total, *subset.sets_of(camera))
-        return to_device(np.maximum(total, LEAST_PART * self._column_sum), float)
-
-    def _joint_partition(self, subsets: tuple[Subset, ...]) -> Partition:
-        """Return subsets of all cameras. All have the same step, of another length each."""
-        derived, key = self._weights.derived, ("lengths of joint subsets", len(subsets))
-        if key not in derived:
-            derived[key] = joint_lengths(self._weights, subsets)
-        lengths, excess = derived[key]
-        size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
-        plain = (SmartStep(size, self.sieve),) * len(subsets)
-        if self.sieve.sigma_voxel == 0:
-            return Partition(subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
-        sharpened = (SharpenedStep(size, self.sieve),) * len(subsets)
-        return Partition(subsets, sharpened, plain, lengths, JOINT_CONFLICT)
+    def passes(self, count: int, whole: int | None) -> tuple[int, int]:
+        """Return the most epochs of `count` passes, and the passes over all rays after them; `whole` if stated."""
+        whole = min(WHOLE_PASSES, -(-count // 2)) if whole is None else whole
+        return (max(count - whole, 0) if self.has_subsets else 0), whole
 
     def _partition(self, subsets: tuple[Subset, ...], conflict: float) -> Partition:
         """Return the subsets with the step of each."""
@@ -218,8 +195,68 @@ class Normalisation:
         sums: np.ndarray = derived[key]
         return sums
 
-    def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
-        return to_device(np.divide(numerator, denominator, out=np.zeros_like(self._column_sum), where=where), float)
+
+class RowSubsets(Normalisation):
+    """Subsets of all cameras: rows of pixels under every lens."""
+
+    suffice = True
+
+    @property
+    def sample(self) -> tuple[Subset, ...]:
+        """Subsets by which guesses are compared."""
+        return self._subsets[: -(-len(self._subsets) // COMPARED)]
+
+    @cached_property
+    def partitions(self) -> tuple[Partition, ...]:
+        """The subsets."""
+        return (self._partition(self._subsets),)
+
+    @cached_property
+    def followed(self) -> tuple[Partition, ...]:
+        """The subsets by which an instant is reconstructed from the volume of the one before.
+
+        Without a sieve `FOLLOWED_STEPS` of them.
+        """
+        return self.partitions if self.sieve.sigma_voxel > 0 else (self.partitions[0].part(slice(FOLLOWED_STEPS)),)
+
+    following_time = FOLLOWING_TIME
+
+    @cached_property
+    def correcting(self) -> Partition:
+        """The subset by which an instant is corrected after its comparison with those beside it.
+
+        It has some ray rows of all cameras, see `correcting_subset`.
+        """
+        parts, chosen = correcting_subset(len(self._weights.cameras), self._weights.rows)
+        return self._partition(parts).part(slice(chosen, chosen + 1))
+
+    @cached_property
+    def part(self) -> tuple[Subset, DeviceArray]:
+        """The rays of `correcting` and their sum; that is at least `LEAST_PART` of the sum over all rays."""
+        (subset,), total = self.correcting.subsets, np.zeros_like(self._column_sum)
+        for camera, name in enumerate(self._weights.cameras):
+            gain = self._weights.gain(name) * self._camera_gains[camera]
+            self._weights.projector(name).back_project(gain, total, *subset.sets_of(camera))
+        return subset, to_device(np.maximum(total, LEAST_PART * self._column_sum), float)
+
+    def passes(self, count: int, whole: int | None) -> tuple[int, int]:
+        """Return the most epochs of `count` passes, and the passes over all rays after them; `whole` if stated."""
+        after = WHOLE_PASSES if self.sieve.sigma_voxel > 0 else POINT_PASSES
+        whole = min(after, -(-count // 2)) if whole is None else whole
+        return min(max(count - whole, 0), self.partitions[0].most_epochs), whole
+
+    def _partition(self, subsets: tuple[Subset, ...]) -> Partition:
+        """Return subsets of all cameras. All have the same step, of another length each."""
+        derived, key = self._weights.derived, ("lengths of joint subsets", len(subsets))
+        if key not in derived:
+            derived[key] = joint_lengths(self._weights, subsets)
+        lengths, excess = derived[key]
+        size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
+        plain = (SmartStep(size, self.sieve),) * len(subsets)
+        if self.sieve.sigma_voxel == 0:
+            return Partition(subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
+        sharpened = (SharpenedStep(size, self.sieve),) * len(subsets)
+        return Partition(subsets, sharpened, plain, lengths, JOINT_CONFLICT)
 
 
 def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[float, ...], np.ndarray]:

@@ -21,7 +21,7 @@ nearly cancel (`JOINT_CONFLICT`). Without a sieve the volume begins to follow th
 
 The number of steps decides how near the volume comes to the solution. The share of the rays in each step hardly
 matters. So epochs of many subsets end after `MOST_STEPS` steps. Where a first guess shows already where particles are,
-steps by a part of the rays suffice (`Normalisation.followed`, `Normalisation.correcting`).
+steps by a part of the rays suffice (`RowSubsets.followed`, `RowSubsets.correcting`).
 
 Sharpened steps can raise the misfit however short they are (`lfpiv.reconstruction.steps`). Where the misfit of an epoch
 rises, the epoch is undone, the momentum starts anew, and SMART's own steps follow (here divided by sums that are not
@@ -62,6 +62,10 @@ WHOLE_PASSES = 2
 """Passes over all rays after the last epoch, at most half of all passes."""
 POINT_PASSES = 5
 """The same after subsets of all cameras without a sieve, which are left early."""
+FOLLOWING_TIME = 8.0
+"""Nesterov's time at which the momentum begins in an instant that starts from the one before. Its few steps are longer
+than plain ones. The time is 1 where there is no sieve and subsets are of lenses: longer steps by these follow the
+noise."""
 SHORTENING = 0.05
 """Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
 CONFLICT = 0.5
@@ -154,6 +158,11 @@ class Agreement:
         self._totals.add_squares(1, self._weight, self._sum)
         squares, square = self._totals.read()
         return square / squares if squares > 0 else 1.0
+
+
+def whole_subset(cameras: int) -> Subset:
+    """Return the subset of all rays of all cameras."""
+    return Subset(tuple((camera, ALL) for camera in range(cameras)))
 
 
 def subsets_of(cameras: int, sets: int = 1) -> tuple[Subset, ...]:

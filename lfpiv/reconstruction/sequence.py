@@ -57,10 +57,8 @@ DIMMEST = 0.05
 FAINTEST = 1e-6
 """Least light of a voxel in the first guess, as a share of the brightest one. SMART can raise it; it cannot raise 0."""
 
-FOLLOWING_TIME, CORRECTING_TIME = 8.0, 2.0
-"""Nesterov's time at which the momentum begins in an instant that starts from the one before, and in its correction:
-their few steps are longer than plain ones. From the instant before it begins at 1 where there is no sieve and subsets
-are whole cameras or halves of their lenses: longer steps by these follow the noise."""
+CORRECTING_TIME = 2.0
+"""Nesterov's time at which the momentum begins in a correction: its few steps are longer than plain ones."""
 TRIES = 2
 """Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
@@ -248,8 +246,8 @@ class SequenceSolver:
         if not normal.followed:
             return prepared.solve(iterations=count, first=guess, brief=True, progress=progress)
         count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
-        time = FOLLOWING_TIME if normal.is_joint or normal.sieve.sigma_voxel > 0 else 1.0
-        return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
+        following = {"partitions": normal.followed, "time": normal.following_time}
+        return prepared.refine(guess, epochs=count, brief=True, progress=progress, **following)
 
     def _flow(self, before: Before | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""

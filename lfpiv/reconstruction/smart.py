@@ -17,13 +17,12 @@ import numpy as np
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.steps import Step
-from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
 from lfpiv_kernels.reconstruction.sums import Totals
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.reconstruction.voxels import darken
 from lfpiv_kernels.replay import Replay
-from lfpiv_kernels.transfer import DeviceArray, clear, empty, zeros
+from lfpiv_kernels.transfer import DeviceArray, clear, zeros
 
 
 @dataclass(frozen=True)
@@ -82,9 +81,10 @@ class ImageEquations:
     def back_project(self, volume: DeviceArray) -> DeviceArray:
         """Back-project the logarithms that `compare` left: sum_i w log((I + b) / (P + b)); 0 where `volume` is 0."""
         exponent = zeros(volume.size)
-        for number in range(len(self.cameras)):
-            self._gather(number, ALL, volume, exponent)
-        return self._without_dark(exponent, volume)
+        for camera in self.cameras:
+            camera.projector.gather(exponent, active=volume)
+        darken(exponent, volume)
+        return exponent
 
     def begin(self) -> None:
         """Begin to sum the misfits of `compare_part` anew."""
@@ -100,30 +100,15 @@ class ImageEquations:
         The misfits are added to those since `begin`. The exponent is 0 where `volume` is 0. The next call may
         overwrite it.
         """
-        if all(camera.projector.takes_rows for camera in self.cameras):  # short launches, nothing streamed
-            return self._replay(tuple(parts), partial(self._find_exponent, parts), volume)
-        exponent = empty(volume.size)
-        self._find_exponent(parts, volume, exponent)
-        return exponent
+        return self._replay(tuple(parts), partial(self._find_exponent, parts), volume)
 
     def _find_exponent(self, parts: Sequence[tuple[int, int]], volume: DeviceArray, exponent: DeviceArray) -> None:
         """Write what `exponent_of` returns."""
         clear(exponent)
         for camera, ray_set in parts:
             self.compare_part(camera, ray_set, volume)
-            self._gather(camera, ray_set, volume, exponent)
-        self._without_dark(exponent, volume)
-
-    def _gather(self, camera: int, ray_set: int, volume: DeviceArray, exponent: DeviceArray) -> None:
-        """Add what the rays of one camera hold to an exponent; at least where `volume` is not 0."""
-        projector = self.cameras[camera].projector
-        projector.gather(exponent, active=None if projector.takes_rows else volume, ray_set=ray_set)
-
-    def _without_dark(self, exponent: DeviceArray, volume: DeviceArray) -> DeviceArray:
-        """Return an exponent that is 0 where `volume` is 0."""
-        if any(camera.projector.takes_rows for camera in self.cameras):
-            darken(exponent, volume)
-        return exponent
+            self.cameras[camera].projector.gather(exponent, active=volume, ray_set=ray_set)
+        darken(exponent, volume)
 
     def measured(self) -> Misfit:
         """Return the misfit that was summed since `begin`."""

@@ -12,8 +12,8 @@ from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.depth_spread import rows_resolve_depth
 from lfpiv.reconstruction.instant import PreparedInstant
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
-from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import Subset, joint_subsets, subsets_of
+from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
+from lfpiv.reconstruction.ordered_subsets import Subset, joint_subsets, subsets_of, whole_subset
 from lfpiv.reconstruction.particle_size import UNLIKE, ParticleSizer
 from lfpiv.reconstruction.recording import checked_images, record
 from lfpiv.reconstruction.result import Reconstruction
@@ -45,7 +45,7 @@ class SmartSolver:
     def __init__(self, weights: Weights, settings: SmartSettings):
         self.weights = weights
         self.settings = settings
-        self._last: tuple[tuple[object, ...], np.ndarray | None, Normalisation] | None = None
+        self._last: tuple[tuple[object, ...], np.ndarray | None, LensSubsets | RowSubsets] | None = None
 
     def solve(
         self,
@@ -100,11 +100,14 @@ class SmartSolver:
             equations=equations,
         )
 
-    def _normalisation(self, camera_gains: dict[str, float], sieve: Sieve, solid: np.ndarray | None) -> Normalisation:
+    def _normalisation(
+        self, camera_gains: dict[str, float], sieve: Sieve, solid: np.ndarray | None
+    ) -> LensSubsets | RowSubsets:
         """Return what all instants with these brightnesses, sieve and mask share; that of the last ones is kept."""
         key = (*camera_gains.values(), sieve)
         if self._last is None or self._last[0] != key or not _same(self._last[1], solid):
-            made = Normalisation(self.weights, self.settings, self.subsets, solid, camera_gains, sieve)
+            kind = RowSubsets if self.weights.rows > 1 and len(self.subsets) > 1 else LensSubsets
+            made = kind(self.weights, self.settings, self.subsets, solid, camera_gains, sieve)
             self._last = key, solid, made
         return self._last[2]
 
@@ -118,23 +121,24 @@ class SmartSolver:
             If the rays cannot be cut into the number of subsets that the settings ask for.
         """
         cameras, wanted = len(self.weights.cameras), self.settings.subsets
+        automatic, may = isinstance(wanted, str), self.settings.allows_subsets
         sets = min(self.weights.projector(name).ray_sets for name in self.weights.cameras)
         if not all(self._sees_alone(name) for name in self.weights.cameras):
             sets = 1
-        if self.weights.has_ray_rows and sets > 1:
-            if isinstance(wanted, str):
-                wanted = sets if self.settings.allows_subsets and rows_resolve_depth(self.weights) else 1
-            if wanted > sets:
-                raise ValueError(f"subsets: with these cameras expected 1 to {sets}, got {wanted}.")
-            return joint_subsets(cameras, sets, wanted) if wanted > 1 else subsets_of(1)
-        possible = sorted({1, cameras, sets * cameras})
-        if isinstance(wanted, str):
-            few = cameras <= FEW_CAMERAS or sets == 1
-            wanted = (possible[-1] if few else cameras) if self.settings.allows_subsets else 1
-        if wanted not in possible:
-            numbers = ", ".join(map(str, possible))
-            raise ValueError(f"subsets: with these cameras expected one of {numbers}, got {wanted}.")
-        return subsets_of(cameras, wanted // cameras) if wanted > 1 else subsets_of(1)
+        rows = min(self.weights.rows, sets)
+        if rows > 1:
+            possible, most = range(1, rows + 1), rows if may and automatic and rows_resolve_depth(self.weights) else 1
+            numbers = f"1 to {rows}"
+        else:
+            possible = sorted({1, cameras, sets * cameras})
+            most = sets * cameras if cameras <= FEW_CAMERAS or sets == 1 else cameras
+            numbers = "one of " + ", ".join(map(str, possible))
+        count = (most if may else 1) if isinstance(wanted, str) else wanted
+        if count not in possible:
+            raise ValueError(f"subsets: with these cameras expected {numbers}, got {count}.")
+        if count == 1:
+            return (whole_subset(cameras),)
+        return joint_subsets(cameras, rows, count) if rows > 1 else subsets_of(cameras, count // cameras)
 
     def _sees_alone(self, name: str) -> bool:
         """Return whether most of a camera's pixels see a single set of rays, and each set has some."""

@@ -107,7 +107,7 @@ class MemoryLeft:
         if self._device is not None and size > (left := min(self._device, most)):
             raise InputError(
                 f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
-                f"{size_text(max(left, 0))} are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers "
+                f"{size_text(max(int(left), 0))} are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers "
                 "per GPU, or --device cpu."
             )
 

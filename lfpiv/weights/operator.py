@@ -179,9 +179,9 @@ class Weights(Shown):
         return self._projectors[name]
 
     @property
-    def has_ray_rows(self) -> bool:
-        """Whether all cameras can take rows of pixels under each lens alone."""
-        return all(projector.takes_rows for projector in self._projectors.values())
+    def rows(self) -> int:
+        """Sets of rows of pixels under each lens that all cameras can take alone; 1 where they take lenses."""
+        return min(projector.rows for projector in self._projectors.values())
 
     @property
     def grid(self) -> Grid:

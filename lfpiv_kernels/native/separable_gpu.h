@@ -196,17 +196,15 @@ LFPIV_INLINE void return_across(const SeparableArrays& in, int warp, const float
     });
 }
 
-/// Add to 32 voxels the light of lines: the adjoint of `sum_down`. Voxels whose `active`, if it is given, is 0 do not
-/// change. With `lit` all weights count as 1.
+/// Add to 32 voxels the light of lines: the adjoint of `sum_down`. With `lit` all weights count as 1.
 LFPIV_INLINE void return_down(const SeparableArrays& in, int warp, const float* lines, const RayRows& rows,
-                              const float* active, bool lit, float* volume_out) {
+                              bool lit, float* volume_out) {
     for_lanes([&](int lane) {
         const int number = warp * LANES_OF_WARP + lane, column = number % in.columns;
         const int at_row = number / in.columns, row = at_row % in.rows, plane = at_row / in.rows;
         if (plane >= in.planes) return;
         const int64_t voxel =
             (int64_t)row * in.row_stride + (int64_t)plane * in.plane_stride + (int64_t)column * in.column_stride;
-        if (active && active[voxel] == 0.0f) return;
         const int block = column / COLUMN_BLOCK, taps = in.down_taps[plane];
         float light = 0.0f;
         for (int n = 0; n < rows.count; ++n)

@@ -35,7 +35,7 @@ class NodeProjector(Projector):
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
-        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
+        Voxels whose `active`, shape (voxel,), float32, is zero stay as they are.
         """
         volume, mask = to_device(out, float), None if active is None else to_device(active, float)
         if mask is not None and runtime.device().form == "cpu" and to_host(mask).all():

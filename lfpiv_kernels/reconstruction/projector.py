@@ -227,7 +227,7 @@ class Projector(RayProjector):
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
 
-        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
+        Voxels whose `active`, shape (voxel,), float32, is zero stay as they are.
         """
         volume, device = to_device(out, float), runtime.device().warp
         mask = voxels.ones(volume.size) if active is None else to_device(active, float)

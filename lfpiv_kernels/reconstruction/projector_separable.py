@@ -120,11 +120,9 @@ class SeparableProjector(RayProjector):
         Number of sets of rays.
     """
 
-    takes_rows = True
-
     def __init__(self, weights: SeparableWeights, sets: int):
         super().__init__()
-        self.weights, self.ray_sets, self.parts = weights, sets, (weights,)
+        self.weights, self.ray_sets, self.rows, self.parts = weights, sets, sets, (weights,)
         self.form, self.nbytes = weights.form, weights.nbytes
         self.rays = zeros(weights.ray_rows * weights.rays_of_row)
         self.returned = zeros(weights.ray_rows * weights.rays_of_row)
@@ -191,19 +189,14 @@ class SeparableProjector(RayProjector):
         return max(-(-self.weights.lenses // pieces), LENS_BLOCK)
 
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
-        """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
-
-        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
-        """
-        volume, mask = to_device(out, float), None if active is None else to_device(active, float)
+        """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`."""
+        volume = to_device(out, float)
         if self._on_gpu is not None:
-            self._on_gpu.gather(self.returned, self._ray_rows(ray_set), mask, volume)
-            overwrite(out, volume)
-            return out
-        found = volume if mask is None and not self._moved else zeros(volume.size)
-        found = self._gather(self._arrays, self.returned, ray_set, found)
-        if found is not volume:
-            voxels.add(found, volume, mask)
+            self._on_gpu.gather(self.returned, self._ray_rows(ray_set), volume)
+        else:
+            found = self._gather(self._arrays, self.returned, ray_set, zeros(volume.size) if self._moved else volume)
+            if found is not volume:
+                voxels.add(found, volume)
         overwrite(out, volume)
         return out
 

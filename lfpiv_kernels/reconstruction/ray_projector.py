@@ -36,8 +36,8 @@ class RayProjector:
     ray_sets: int
     """Sets of rays that can be taken alone."""
 
-    takes_rows = False
-    """Whether sets of rays are rows of pixels under every lens, each of which sees the whole volume."""
+    rows = 1
+    """Sets of rows of pixels under every lens that can be taken alone; 1 where the sets are of lenses."""
     form: str
     """Form of the weights, "profiles" or "pixels"."""
     parts: tuple[object, ...]
@@ -81,7 +81,7 @@ class RayProjector:
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
         """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
 
-        Voxels whose `active`, shape (voxel,), float32, is zero do not change.
+        Voxels whose `active`, shape (voxel,), float32, is zero may stay as they are.
         """
         raise NotImplementedError
 

@@ -170,8 +170,7 @@ def _across_back(
 @native.kernel(
     """
     lfpiv::return_down(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), active.data, lit,
-        volume_out.data
+        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), lit, volume_out.data
     );
     """,
     "warp",
@@ -182,7 +181,6 @@ def _down_back(
     separable: Separable,
     lines: wp.array(dtype=float),
     rows: RayRows,
-    active: wp.array(dtype=float),  # which voxels change, if there is any
     lit: bool,
     first_warp: int,
     # out
@@ -232,15 +230,15 @@ class LinesProjector:
             _launch(_across, rays, [weights, self._moved, rows], self._bare)
             _launch(_rim, rays, [weights, self._bare, rows], rays_out)
 
-    def gather(self, rays: wp.array, ray_rows: range, active: wp.array | None, volume_out: wp.array) -> None:
-        """Add the weighted sum of the light on the rays of some ray rows to the voxels that are `active`, or to all."""
+    def gather(self, rays: wp.array, ray_rows: range, volume_out: wp.array) -> None:
+        """Add the weighted sum of the light on the rays of some ray rows to the voxels."""
         weights = self._arrays
         for rows in self._some(ray_rows):
             elements = rows.count * self._elements
             _launch(_rim_back, rows.count * self._weights.rays_of_row, [weights, rays, rows], self._bare)
             _launch(_across_back, elements, [weights, self._bare, rows, False], self._lines)
             _launch(_move, elements, [weights, self._lines, rows, True], self._moved)
-            _launch(_down_back, volume_out.size, [weights, self._moved, rows, active, False], volume_out)
+            _launch(_down_back, volume_out.size, [weights, self._moved, rows, False], volume_out)
 
     def count_lit(self) -> np.ndarray:
         """Count the rays that each voxel lights, shape (voxel,), int32; lines are not moved, and rays have no rim."""
@@ -249,7 +247,7 @@ class LinesProjector:
         for rows in self._some(range(self._weights.ray_rows)):
             bare = seen[rows.first * size : (rows.first + rows.count) * size]
             _launch(_across_back, rows.count * self._elements, [weights, bare, rows, True], self._lines)
-            _launch(_down_back, count.size, [weights, self._lines, rows, None, True], count)
+            _launch(_down_back, count.size, [weights, self._lines, rows, True], count)
         return np.rint(to_host(count)).astype(np.int32)
 
 

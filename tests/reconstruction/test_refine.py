@@ -9,7 +9,7 @@ from lfpiv.reconstruction.normalisation import COMPARED, FOLLOWED_STEPS
 from lfpiv.reconstruction.ordered_subsets import CORRECTING, FEWEST_ROWS, Subset, correcting_subset, joint_subsets
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.weights import separable
+from lfpiv.weights.forms import shared_profiles
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import to_device, to_host
 
@@ -28,7 +28,7 @@ def recorded(request, device):
     """Weights of voxels or of planes of voxels, a true volume and its images."""
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "planes":
-            patch.setattr(separable, "FEWEST_VOXELS", 0)
+            patch.setattr(shared_profiles, "FEWEST_VOXELS", 0)
         return noisy_blobs(40)
 
 
@@ -116,7 +116,7 @@ def test_a_guess_by_a_part_of_the_rays_equals_its_twin(recorded, sieve_voxel):
     weights = recorded[0]
     prepared = prepared_from(recorded, sieve_voxel)
     normal, whole, found = prepared.normalisation, prepared.solve(iterations=0), prepared.guess()
-    if not weights.has_ray_rows:
+    if weights.rows == 1:
         np.testing.assert_array_equal(found.volume, whole.volume)
         return
     names, (subset,) = list(weights.cameras), normal.correcting.subsets
@@ -156,7 +156,7 @@ def test_a_correction_takes_rows_that_lie_apart_and_were_not_sampled(rows):
 def test_rows_of_pixels_where_there_are_some(recorded, sieve_voxel):
     normal = prepared_from(recorded, sieve_voxel).normalisation
     (correcting,) = normal.correcting.subsets
-    if not recorded[0].has_ray_rows:
+    if recorded[0].rows == 1:
         assert correcting == Subset(((0, ALL), (1, ALL))) and normal.followed == normal.partitions
         return
     rows = min(recorded[0].projector(name).ray_sets for name in recorded[0].cameras)

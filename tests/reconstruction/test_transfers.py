@@ -13,7 +13,7 @@ import lfpiv
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.weights import separable
+from lfpiv.weights.forms import shared_profiles
 from lfpiv_kernels import runtime
 from lfpiv_kernels.transfer import count_transfers
 
@@ -38,9 +38,9 @@ def recorded(request, device):
     """Return weights, those of voxels or profiles that planes of voxels share, and images."""
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "planes":
-            patch.setattr(separable, "FEWEST_VOXELS", 0)
+            patch.setattr(shared_profiles, "FEWEST_VOXELS", 0)
         weights, _, images = noisy_blobs(40)
-    assert weights.has_ray_rows == (request.param == "planes")
+    assert (weights.rows > 1) == (request.param == "planes")
     return weights, images
 
 
@@ -69,7 +69,7 @@ def test_a_reconstruction_moves_its_images_its_volume_and_two_scalars_a_pass(rec
     sizes = Counter(counted.to_host)
     assert sizes.pop(4 * weights.grid.size) == 1
     assert set(sizes) == {SCALARS}
-    grows = case == "subsets that may grow" or weights.has_ray_rows  # each epoch looks at the subsets' agreement
+    grows = case == "subsets that may grow" or weights.rows > 1  # each epoch looks at the subsets' agreement
     passes = len(found.misfit)  # at least: SMART may compare several proposals of a step
     assert passes <= sizes[SCALARS] <= (2 if grows or "subsets" not in case else 1) * passes + 1
 
@@ -102,7 +102,7 @@ def test_coefficients_of_a_volume_are_found_on_the_device(recorded, moves):
 
 
 def test_a_step_over_a_subset_launches_few_sweeps_and_reuses_its_memory(recorded, monkeypatch):
-    """One sweep scales the exponent, one takes the step with its momentum; one masks the exponent of rows of pixels."""
+    """One sweep scales the exponent, one takes the step with its momentum, and one masks the exponent."""
     if runtime.device().kind == "cuda":
         pytest.skip("a replay launches nothing from Python")
     launched, launch = Counter(), wp.launch
@@ -124,7 +124,7 @@ def test_a_step_over_a_subset_launches_few_sweeps_and_reuses_its_memory(recorded
     each = {name: (counts[1][name] - counts[0][name]) / steps for name in ("_multiply", "_sharpen", "_blur")}
     blurs = each.pop("_blur")
     assert each == {"_multiply": 1, "_sharpen": 1} and blurs <= 2 * runtime.CHUNKS
-    assert counts[1]["_darken"] - counts[0]["_darken"] == (steps if recorded[0].has_ray_rows else 0)
+    assert counts[1]["_darken"] - counts[0]["_darken"] == steps
     assert "_update" not in counts[1]
 
 

@@ -67,7 +67,7 @@ def both(device):
 
 def test_profiles_are_shared_where_rows_of_lenses_are_level(both):
     shared, every = both
-    assert shared.has_ray_rows and not every.has_ray_rows
+    assert shared.rows > every.rows == 1
     assert shared.forms == every.forms == {"one": "profiles", "two": "profiles"}
     assert shared.memory_bytes < 0.7 * every.memory_bytes
 
@@ -83,7 +83,7 @@ def test_profiles_are_shared_where_rows_of_lenses_are_level(both):
 )
 def test_profiles_are_not_shared_where_one_camera_does_not_suit(cameras, device):
     rig = rig_of(*cameras)
-    assert not lfpiv.build_weights(rig, GRID).has_ray_rows
+    assert lfpiv.build_weights(rig, GRID).rows == 1
     assert not profiles_of(rig.cameras).build(lambda name: lambda part: None)
 
 
@@ -121,7 +121,7 @@ def test_memory_of_a_gpu_is_estimated(both):
 
 def test_small_volumes_store_all_voxels(device):
     grid = lfpiv.Grid(shape=(20, 20, 20), voxel_mm=0.05, first_centre_mm=(-0.5, -0.5, -0.5))
-    assert not lfpiv.build_weights(rig_of(camera()), grid).has_ray_rows
+    assert lfpiv.build_weights(rig_of(camera()), grid).rows == 1
 
 
 def test_images_of_other_particles_are_those_of_footprints(both):
@@ -198,7 +198,7 @@ def test_overlapping_microimages_are_not_taken_row_by_row(device):
         for name, yaw in (("one", 45), ("two", -45))
     ]
     weights = lfpiv.build_weights(rig_of(*wide), GRID)
-    assert weights.has_ray_rows  # profiles are shared all the same
+    assert weights.rows > 1  # profiles are shared all the same
     assert SmartSolver(weights, SmartSettings()).subsets == (Subset(((0, ALL),)), Subset(((1, ALL),)))
     with pytest.raises(ValueError, match=r"subsets: with these cameras expected one of 1, 2, got 4\."):
         _ = SmartSolver(weights, SmartSettings(subsets=4)).subsets
@@ -209,7 +209,7 @@ def test_stored_weights_are_opened_as_they_were(both, tmp_path):
     content = save_weights(shared, tmp_path / "weights")
     opened = open_weights(tmp_path / "weights", shared.cameras, content)
     volume = np.random.default_rng(3).random(GRID.shape).astype(np.float32)
-    assert opened.has_ray_rows and opened.stored == shared.stored
+    assert opened.rows == shared.rows > 1 and opened.stored == shared.stored
     for name, image in shared(volume).items():
         assert isinstance(opened.projector(name), SeparableProjector)
         np.testing.assert_array_equal(opened(volume)[name], image)

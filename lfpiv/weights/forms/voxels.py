@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from lfpiv.progress import StepProgress
 from lfpiv.weights.blocks import (
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 class Voxels(Form):
     """Weights of each voxel. They suit all cameras."""
 
-    projector: type[Projector] = Projector
-    parts = (Blocks,)
+    projector: ClassVar[type[Projector]] = Projector
+    parts: ClassVar[tuple[type, ...]] = (Blocks,)
 
     @property
     def suits(self) -> Sequence[str]:
