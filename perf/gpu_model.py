@@ -33,7 +33,7 @@ from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, State
 from lfpiv.reconstruction.steps import SharpenedStep, SmartStep
-from lfpiv.weights import separable
+from lfpiv.weights.forms import shared_profiles
 from lfpiv_kernels import runtime
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
@@ -142,7 +142,7 @@ class Model:
         if refinement != 1.0:
             edge = voxels.voxel_mm / refinement
             voxels = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(0.1 * of["voxels"],) * 3, voxel_mm=edge)
-        with patch.object(separable, "are_possible", lambda *_: False):  # the weights of voxels
+        with patch.object(shared_profiles, "are_possible", lambda *_: False):  # the weights of voxels
             weights = lfpiv.build_weights(rig(of["sensor"]), voxels, form=form)
         first, *others = map(weights.projector, weights.cameras)
         with loops_for_a_gpu():

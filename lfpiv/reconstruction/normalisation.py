@@ -149,8 +149,8 @@ class LensSubsets(Normalisation):
 
     @property
     def followed(self) -> tuple[Partition, ...]:
-        """The subsets by which an instant is reconstructed from the volume of the one before."""
-        return self.partitions
+        """The subsets by which an instant is reconstructed from the volume of the one before; none for whole passes."""
+        return self.partitions if self.has_subsets else ()
 
     @property
     def following_time(self) -> float:

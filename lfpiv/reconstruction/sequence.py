@@ -245,9 +245,8 @@ class SequenceSolver:
         normal = prepared.normalisation
         if not normal.followed:
             return prepared.solve(iterations=count, first=guess, brief=True, progress=progress)
-        count = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1)
-        following = {"partitions": normal.followed, "time": normal.following_time}
-        return prepared.refine(guess, epochs=count, brief=True, progress=progress, **following)
+        count, time = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1), normal.following_time
+        return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
 
     def _flow(self, before: Before | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next instant is predicted, and the last one measured, if known."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -127,7 +127,8 @@ class SmartSolver:
             sets = 1
         rows = min(self.weights.rows, sets)
         if rows > 1:
-            possible, most = range(1, rows + 1), rows if may and automatic and rows_resolve_depth(self.weights) else 1
+            possible: Sequence[int] = range(1, rows + 1)
+            most = rows if may and automatic and rows_resolve_depth(self.weights) else 1
             numbers = f"1 to {rows}"
         else:
             possible = sorted({1, cameras, sets * cameras})

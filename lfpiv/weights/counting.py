@@ -2,7 +2,7 @@
 
 Object points in a voxel and points in the pupil are stratified samples. `count_voxels` traces and counts them. A few
 counted voxels, `CountedVoxels`, measure the error of integrated weights. For whole grids see
-`lfpiv.weights.counted_grid`.
+`lfpiv.weights.forms.counted`.
 """
 
 from __future__ import annotations

@@ -104,12 +104,13 @@ class MemoryLeft:
 
     def require_device(self, name: str, size: int, most: float = math.inf) -> None:
         """Raise InputError if the weights of a camera do not fit into the GPU [byte], or are more than `most`."""
-        if self._device is not None and size > (left := min(self._device, most)):
-            raise InputError(
-                f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which "
-                f"{size_text(max(int(left), 0))} are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers "
-                "per GPU, or --device cpu."
-            )
+        if self._device is None or size <= min(self._device, most):
+            return
+        left = max(int(min(self._device, most)), 0)
+        raise InputError(
+            f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which {size_text(left)} "
+            "are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers per GPU, or --device cpu."
+        )
 
     def take(self, projector: RayProjector) -> None:
         """Count the memory of built weights as taken."""

@@ -136,7 +136,7 @@ def test_loops_for_a_gpu_give_the_light_of_those_for_the_cpu(case, at_once, monk
     for ray_set, ray_rows in ((ALL, range(weights.ray_rows)), (1, range(1, weights.ray_rows, SETS))):
         rays, gathered = zeros(len(light)), zeros(len(volume))
         lines.scatter(to_device(volume), ray_rows, rays)
-        lines.gather(to_device(light), ray_rows, None, gathered)
+        lines.gather(to_device(light), ray_rows, gathered)
         with projector.reserved():
             projector.rays.zero_()
             projector.scatter(volume, ray_set)

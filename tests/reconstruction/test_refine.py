@@ -152,6 +152,12 @@ def test_a_correction_takes_rows_that_lie_apart_and_were_not_sampled(rows):
     assert len(taken) == rows or not sampled & set(taken)
 
 
+def test_without_subsets_all_rays_of_all_cameras_follow_an_instant(recorded):
+    solver = SmartSolver(recorded[0], SmartSettings(subsets=1))
+    assert solver.subsets == (Subset(((0, ALL), (1, ALL))),)
+    assert not solver.prepare(recorded[2]).normalisation.followed  # whole passes follow
+
+
 @pytest.mark.parametrize("sieve_voxel", SIEVES)
 def test_rows_of_pixels_where_there_are_some(recorded, sieve_voxel):
     normal = prepared_from(recorded, sieve_voxel).normalisation
