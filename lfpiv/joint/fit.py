@@ -16,9 +16,8 @@ import numpy as np
 from lfpiv.joint.displacement_steps import DisplacementSteps, Residual
 from lfpiv.joint.light_steps import Light, LightSteps
 from lfpiv.joint.model import JointModel
-from lfpiv.reconstruction.ordered_subsets import Subset
+from lfpiv.reconstruction.ordered_subsets import Subset, whole_subset
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv_kernels.reconstruction.pixel_rays import ALL
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +102,6 @@ def fit_pair(
 def _curvature_rays(steps: LightSteps, cameras: int) -> Subset:
     """Return the rays whose curvature stands for that of all: some subsets of all cameras, or every ray."""
     subsets = steps.partitions[0].subsets
-    if steps.model.frames[0].normalisation.is_joint and len(subsets) >= PART:
+    if len(subsets) >= PART and len(subsets[0].parts) >= cameras:
         return Subset(tuple(part for subset in subsets[: len(subsets) // PART] for part in subset.parts))
-    return Subset(tuple((camera, ALL) for camera in range(cameras)))
+    return whole_subset(cameras)

@@ -12,10 +12,9 @@ import numpy as np
 
 from lfpiv.joint.model import LARGEST_LOSS, JointModel
 from lfpiv.reconstruction.momentum import Momentum
-from lfpiv.reconstruction.normalisation import Normalisation
-from lfpiv.reconstruction.ordered_subsets import SHORTENING, SUBSET_MOMENTUM, Partition, Subset
+from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
+from lfpiv.reconstruction.ordered_subsets import SHORTENING, SUBSET_MOMENTUM, Partition, whole_subset
 from lfpiv.reconstruction.steps import LARGEST_STEP, SHARPENING, SharpenedStep, SmartStep
-from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.transport import Transport
 from lfpiv_kernels.reconstruction.update import sharpen
 from lfpiv_kernels.transfer import DeviceArray, duplicate, to_device, to_host
@@ -111,10 +110,9 @@ class LightSteps:
         model.rho = np.clip(rho, -LARGEST_LOSS, LARGEST_LOSS)
 
 
-def _partition(normalisation: Normalisation, cameras: int) -> Partition:
+def _partition(normalisation: LensSubsets | RowSubsets, cameras: int) -> Partition:
     """Return the subsets to iterate over: those of the reconstruction, or all rays at once."""
     if normalisation.has_subsets:
         found: Partition = normalisation.partitions[0]
         return found
-    every = Subset(tuple((camera, ALL) for camera in range(cameras)))
-    return Partition((every,), normalisation.steps[:1])
+    return Partition((whole_subset(cameras),), normalisation.steps[:1])

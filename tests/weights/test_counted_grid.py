@@ -15,8 +15,8 @@ import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.runs import pipeline
 from lfpiv.settings.processing import Compute
-from lfpiv.weights import counted_grid
 from lfpiv.weights.counting import count_voxels
+from lfpiv.weights.forms import counted
 from lfpiv.weights.forms.counted import counter_of
 from lfpiv.weights.ray_fit import ray_models
 from lfpiv_kernels import reference, runtime
@@ -78,7 +78,7 @@ def test_count_kernel_equals_its_twin(name):
     )
     starts = [np.concatenate([[0], np.cumsum(counts)]) for counts in (blocks, values)]
     dense = images_of(
-        counted_grid.Blocks(
+        counted.Blocks(
             form="pixels",
             first_block=starts[0],
             first_value=starts[1],
@@ -158,7 +158,7 @@ def test_counts_do_not_depend_on_threads_lanes_batches_or_room(monkeypatch):
                 patch.setattr(counted_blocks.runtime, "device_of_taichi", lambda other=other: other)
                 assert same(count(camera, rays=1024), expected), change
         with monkeypatch.context() as patch:
-            patch.setattr(counted_grid, "BATCH_VOXELS", 1)
+            patch.setattr(counted, "BATCH_VOXELS", 1)
             patch.setattr(counted_blocks, "CHUNK_VOXELS", 4)
             patch.setattr(counted_blocks, "FIRST_ROOM", (1, 1))
             assert same(count(camera, rays=1024), expected)
