@@ -81,8 +81,8 @@ def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launc
     forward, back = ("_project", "_back_project") if chunks > 1 else ("_scatter", "_gather")
     compare = counts[0]["_compare"] // (3 * CAMERAS)  # small images and volumes are cut into fewer chunks
     assert 0 < compare <= chunks
-    # per iteration and camera one projection, comparison and back projection, and one update of the volume, which is
-    # small; before the first iteration a misfit
+    # per iteration and camera one projection, comparison and back projection; then one mask of the exponent and one
+    # update of the volume, which is small; before the first iteration a misfit
     for count, iterations in zip(counts, (2, 5), strict=True):
         compared = (iterations + 1) * CAMERAS
         sums = {"_sum": 4 * compared, "_add_up": 2 * compared}  # a GPU adds the two sums of the misfit itself
@@ -91,6 +91,7 @@ def test_smart_launches_and_allocates_the_same_in_every_iteration(weights, launc
             "_compare": (iterations + 1) * CAMERAS * compare,
             back: iterations * CAMERAS * chunks,
             "_update": iterations,
+            "_darken": iterations,
             "_multiply": 1,  # the caller's first guess, where a camera sees it
         } | ({} if chunks > 1 else sums)
     pixels = np.prod(next(iter(images.values())).shape)
