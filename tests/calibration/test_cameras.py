@@ -171,6 +171,7 @@ def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
     assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, stretches))
 
 
+@pytest.mark.slow
 def test_what_is_right_has_no_mistake(rig):
     experiment, _, calibration = rig
     decoder = calibration.cameras["only"].decoder
@@ -218,7 +219,7 @@ def test_a_flip_that_nothing_shows_is_asked_for(rig):
         assert [warning.code for warning in warnings] == codes
 
 
-@pytest.mark.slow(but="stated0")
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [(6, 6), (8, 5), (4, 4)])
 def test_a_board_stated_larger_or_smaller_than_it_is_is_refused(rig, stated):
     """An even number for an odd one shifts all dots by half a spacing, and no other check finds it."""

@@ -73,6 +73,7 @@ def test_two_workers_share_pairs_and_threads(planned):
     assert f"{math.prod(planned.vectors):,} per pair" in card and "1,000 pairs with 2 workers" in card
 
 
+@pytest.mark.slow
 def test_the_command_needs_neither_particle_images_nor_a_calibration(small_run, tmp_path, capfd):
     experiment = small_run.images(tmp_path / "data")
     for image in (experiment.parent / "particles").rglob("*.*"):

@@ -42,6 +42,7 @@ def partitions_of(prepared):
     return [*prepared.normalisation.followed, prepared.normalisation.correcting]
 
 
+@pytest.mark.slow(but="voxels")
 @pytest.mark.parametrize("sieve_voxel", SIEVES)
 def test_misfits_of_some_rays_stand_for_those_of_all(recorded, sieve_voxel):
     prepared, guess = prepared_from(recorded, sieve_voxel), recorded[1].astype(np.float32)

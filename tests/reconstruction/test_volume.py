@@ -102,6 +102,7 @@ def accelerated_twin(matrix, image, first, *, iterations, floor):
     return point, restarts
 
 
+@pytest.mark.slow(but="0-True")
 @pytest.mark.parametrize(
     ("seed", "accelerate", "iterations"), [(0, False, 2_000), (0, True, 400), (1, True, 400), (2, True, 400)]
 )
@@ -426,6 +427,7 @@ def test_a_sharp_step_that_raises_the_misfit_is_taken_back(gain):
     assert misfits[-1] < 0.7 * misfits[0]
 
 
+@pytest.mark.slow
 def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated():
     positions, grid = (
         np.random.default_rng(4).uniform(0, 1.6, (150, 3)),

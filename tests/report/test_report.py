@@ -148,6 +148,7 @@ def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported,
     assert overview.warnings(figures(reported.summary | {"failed": [], "warnings": []})) == ""
 
 
+@pytest.mark.slow
 def test_a_series_is_reported_by_instant(reported, tmp_path):
     series = Series(instants=report_run.PAIRS + 2, first=0, step=2)
     experiment = dataclasses.replace(reported.experiment, series=series, pairs=report_run.PAIRS)

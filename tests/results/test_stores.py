@@ -102,6 +102,7 @@ def test_chunks_suit_a_point_and_a_field(run, form):
     assert chunks[0] == 2 and 4 * np.prod(chunks) <= 500 < 8 * np.prod(chunks)
 
 
+@pytest.mark.slow(but="pairs")
 def test_an_export_adds_what_is_new_and_changed(run, monkeypatch):
     pytest.importorskip("zarr")
     monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
@@ -345,6 +346,7 @@ def test_an_unfinished_store_with_torn_files_is_finished(tmp_path, torn, monkeyp
     xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
 
 
+@pytest.mark.slow(but="zarr")
 def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypatch):
     """HDF5 would crash the process. No disk, but files that may not grow: all of them, or only the last bytes."""
     write_run(tmp_path, NUMBERS)
@@ -415,6 +417,7 @@ def test_statistics_in_parts_are_those_of_the_whole(run, block, monkeypatch):
         assert shared[0] == pytest.approx(shared[1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_statistics_hold_a_block_and_not_the_run(tmp_path, monkeypatch):
     """Without dask, 60 files are averaged in much less memory than they take."""
     hide_dask(monkeypatch)

@@ -149,6 +149,7 @@ def test_a_kept_camera_that_does_not_fit_is_measured_again(interrupted, caplog, 
     assert ("damaged or foreign" in caplog.text) == (change == "damage")
 
 
+@pytest.mark.slow
 def test_the_camera_after_the_kept_one_may_change(interrupted, caplog):
     experiment, out = interrupted
     (experiment.parent / "board" / "right" / "plane_00.tif").touch()

@@ -265,6 +265,7 @@ def test_what_workers_are_forked_from_is_whole_and_has_started_nothing():
     assert done.stdout.split() == ["None", "None", "1"]
 
 
+@pytest.mark.slow(but="options1")
 @pytest.mark.parametrize(
     ("options", "words"),
     [

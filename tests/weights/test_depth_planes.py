@@ -198,6 +198,7 @@ def test_operator_with_nodes_is_that_of_all_voxels(both):
     assert apart.mean() < 0.04 and apart.max() < 0.4
 
 
+@pytest.mark.slow
 def test_operator_with_lines_of_sight_is_that_of_all_voxels(between):
     nodes, every = between
     assert all(nodes.projector(name).shares.column_share.shape[1] == LINES for name in nodes.cameras)
