@@ -22,8 +22,6 @@ from lfpiv_kernels.reconstruction.transport import Transport
 
 ROUGH = 0.3
 """Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel."""
-STEPS = 6
-"""Conjugate gradient steps."""
 SMALL_REST = 1e-3
 """Share of the first residual below which conjugate gradients end."""
 LARGEST_MOVE = 1.0
@@ -86,13 +84,6 @@ class RayPart:
         own = sum(float(images[name].reshape(-1)[at].sum(dtype=np.float64)) for name, at in self._pixels.items())
         return own / whole
 
-    def only(self, images: dict[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
-        """Return images over a share, 0 in pixels that see other rays."""
-        found = {name: np.zeros_like(image) for name, image in images.items()}
-        for name, at in self._pixels.items():
-            found[name].reshape(-1)[at] = images[name].reshape(-1)[at] / np.float32(share)
-        return found
-
     def normal(self, volume: np.ndarray, curvatures: dict[str, np.ndarray]) -> np.ndarray:
         """Return sum over the pixels of w curvature (W volume), shape (z, y, x), float32."""
         stored = self.weights.stored
@@ -125,10 +116,8 @@ class DisplacementSteps:
         self._part = RayPart(model.weights, part)
         self._scale: np.ndarray | None = None
 
-    def residual(
-        self, light: np.ndarray, transports: tuple[Transport, Transport], part: RayPart | None = None
-    ) -> Residual:
-        """Compare the images of the model with the recorded ones; with a part of the rays, its exponents are theirs."""
+    def residual(self, light: np.ndarray, transports: tuple[Transport, Transport]) -> Residual:
+        """Compare the images of the model with the recorded ones."""
         model, exponents, curvatures, figures = self.model, [], [], []
         for number, (frame, transport) in enumerate(zip(model.frames, transports, strict=True)):
             projected = model.weights(model.volume(number, light, transport))
@@ -145,8 +134,6 @@ class DisplacementSteps:
                 norm += float(np.square(image, dtype=np.float64).sum())
                 logs[name] = logarithm * gain
                 curves[name] = np.where(counts, gain**2 / (expected + floor), 0).astype(np.float32)
-            if part is not None:
-                logs = part.only(logs, part.share({name: one.image for name, one in frame.recordings.items()}))
             exponents.append(model.sieved(model.weights.T(logs)))
             curvatures.append(curves)
             figures.append((float(np.sqrt(squares / norm)), misfit))
@@ -182,11 +169,11 @@ class DisplacementSteps:
 
         return change
 
-    def step(self, light: np.ndarray, nodes: np.ndarray, relaxation: float, part: RayPart | None = None) -> Step:
-        """Return a step of the nodes, times a factor, and at most `LARGEST_MOVE`; with a part of the rays, by these."""
+    def step(self, light: np.ndarray, nodes: np.ndarray, relaxation: float, steps: int) -> Step:
+        """Return a step of the nodes by some conjugate gradient steps, times a factor, and at most `LARGEST_MOVE`."""
         model = self.model
         transports = model.transports(nodes)
-        residual = self.residual(light, transports, part)
+        residual = self.residual(light, transports)
         gradient = self.gradient(light, transports, residual)
         curvature = self.curvature(light, transports, residual)
         rough = ROUGH * 2 * residual.misfit / self._lit_pixels
@@ -199,6 +186,7 @@ class DisplacementSteps:
             lambda way: curvature(way) + rough * model.field.penalty(way) + floor * way,
             -(gradient + rough * model.field.penalty(nodes)),
             inverse,
+            steps,
         )
         change *= relaxation
         largest = float(np.abs(model.field.values(change)).max())
@@ -221,13 +209,13 @@ class DisplacementSteps:
 
 
 def _conjugate_gradients(
-    matrix: Callable[[np.ndarray], np.ndarray], rest: np.ndarray, inverse: np.ndarray
+    matrix: Callable[[np.ndarray], np.ndarray], rest: np.ndarray, inverse: np.ndarray, steps: int
 ) -> np.ndarray:
-    """Return an approximate solution of matrix x = rest after at most `STEPS` steps."""
+    """Return an approximate solution of matrix x = rest after some steps."""
     found, scaled = np.zeros_like(rest), inverse * rest
     way, square = scaled.copy(), float((rest * scaled).sum())
     least = SMALL_REST * square
-    for _ in range(STEPS):
+    for _ in range(steps):
         image = matrix(way)
         length = square / float((way * image).sum())
         found += length * way

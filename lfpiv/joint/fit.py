@@ -21,19 +21,32 @@ from lfpiv.reconstruction.result import Reconstruction
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 5
-"""Largest number of rounds."""
-STARTS = 3
-"""Rounds that begin with light made anew from the frames by themselves."""
-EPOCHS = 2
-"""Epochs over the subsets in a round."""
-RELAXATION = 1.5
-"""Factor of the displacement's steps but those of the last `EXACT` rounds: the light hides a part of each step."""
-EXACT = 2
-"""Last rounds, whose steps are not lengthened."""
+
+@dataclass(frozen=True)
+class Round:
+    """One change of the light and of the displacement."""
+
+    fresh: bool
+    """Whether the light is made anew from the frames by themselves."""
+    epochs: int
+    """Epochs over the subsets."""
+    steps: int
+    """Conjugate gradient steps of the displacement."""
+    relaxation: float
+    """Factor of the displacement's step: the light hides a part of it."""
+
+
+ROUNDS = (
+    Round(True, 1, 3, 1.5),
+    Round(True, 1, 3, 1.5),
+    Round(True, 1, 3, 1.5),
+    Round(True, 2, 6, 1.0),
+    Round(False, 2, 6, 1.0),
+)
+"""Rounds of the fit."""
 SETTLED_VOXEL = 0.02
 """Mean change of the displacement below which no other round follows [voxel]."""
-LOST, JUDGED = 2.5, 2
+LOST, JUDGED = 3.2, 2
 """Misfit over that of the frames by themselves, after so many rounds, above which particles are lost between frames.
 The fit then begins again with brightness that may differ."""
 PART = 2
@@ -80,20 +93,21 @@ def fit_pair(
     movement = DisplacementSteps(model, _curvature_rays(steps, len(model.weights.cameras)))
     alone = sum(one.misfit[-1] for one in found)
     first, number, done, light = nodes, 0, 0, Light(model.lit)
-    while number < ROUNDS:
-        if number < STARTS:
+    while number < len(ROUNDS):
+        now = ROUNDS[number]
+        if now.fresh:
             light = Light(model.start(found, nodes))
-        light = steps.epochs(light, model.transports(nodes), EPOCHS)
-        step = movement.step(light.values, nodes, RELAXATION if number < ROUNDS - EXACT else 1.0)
+        light = steps.epochs(light, model.transports(nodes), now.epochs)
+        step = movement.step(light.values, nodes, now.relaxation, now.steps)
         nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
         done += 1
         moved = float(np.abs(model.field.values(step.change)).mean())
         log.debug("round %d: misfit ratio %.3f, moved by %.3f voxel", number, ratio, moved)
         if progress is not None:
-            progress(done / (ROUNDS + JUDGED))
+            progress(done / (len(ROUNDS) + JUDGED))
         if number == JUDGED and ratio > LOST and model.sieve_voxel > 0 and model.rho is None:
             model.rho, nodes, number = np.zeros_like(model.lit), first, 0
-        if number >= STARTS and moved < SETTLED_VOXEL:
+        if not now.fresh and moved < SETTLED_VOXEL:
             break
     residual = movement.residual(light.values, model.transports(nodes))
     return JointFit(light.values, nodes, done, residual.misfit / alone, model.rho is not None, residual)
