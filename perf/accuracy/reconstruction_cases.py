@@ -31,10 +31,10 @@ from lfpiv.simulation.simulator import expose
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 from lfpiv_kernels.rendering import collect, render
 
-SIZE_MM = {"small": (3.2, 3.2, 2.8), "paper": (10.0, 10.0, 5.0)}
+SIZE_MM = {"small": (3.2, 3.2, 2.8), "flat": (4.0, 4.0, 2.4), "paper": (10.0, 10.0, 5.0)}
 """Size of the volume (x, y, z)."""
-PIXEL_UM = {"small": 11.0, "paper": 5.5}
-WINDOWS = {"small": (24, 16, 12, 12), "paper": None}
+PIXEL_UM = {"small": 11.0, "flat": 11.0, "paper": 5.5}
+WINDOWS = {"small": (24, 16, 12, 12), "flat": (24, 16, 12, 12), "paper": None}
 """Windows of the correlation; None: its default."""
 MARGIN_MM = 0.6
 """Width that the sensor images beyond the volume, both sides together."""
@@ -45,7 +45,9 @@ ARRAYS_MM = ((0.031, -0.022), (-0.02, 0.04), (0.01, 0.013), (-0.037, -0.009))
 RAYS = 16_384
 """Rays per particle."""
 WHITE_RAYS, WHITE_COUNTS = 256, 3000.0
-FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent")
+FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent", "abc")
+ABC_MM = 0.092
+"""Amplitude of the flow of Arnold, Beltrami and Childress, whose components are sheared along two axes each."""
 TRACERS, TRACERS_MM = "dns", 8.0
 """Flow of a series, not of a pair, that moves tracers of the sample data, and the edge of their cube [mm]."""
 TRACERS_FILE = Path(__file__).resolve().parents[3] / "shared" / "data" / "dns-tracers" / "rayleigh_benard_series.npz"
@@ -63,6 +65,10 @@ class Condition:
     brightness: Brightness = field(default_factory=Brightness)
     sheet: tuple[float, float] | None = None
     """Thickness of a Gaussian sheet [depth of the volume], and power of the second pulse relative to the first."""
+    dark: float = 0.0
+    """Share of the particles without light in the first frame, and of others in the second one."""
+    flicker: float = 0.0
+    """Standard deviation of the logarithm of a particle's light between the frames."""
     beyond: float = 0.0
     """Depth beyond the faces in which there are particles [depth of the volume]; sideways 0.5 mm."""
     stray: StrayLight | None = None
@@ -74,6 +80,8 @@ CONDITIONS = {
     "poly0": Condition(
         counts=400.0, noise=Noise(background=0.0), brightness=Brightness(camera_log_sd=1.0, size_log_sd=0.35)
     ),
+    "lose": Condition(counts=400.0, noise=Noise(), dark=0.2),
+    "flicker": Condition(counts=400.0, noise=Noise(), flicker=0.5),
     "real": Condition(
         counts=16.0,  # 39 electrons
         noise=Noise(read_noise=0.82),  # 2 electrons
@@ -192,7 +200,22 @@ def make_flow(case: Case):
         law = Turbulence(rms_mm=0.06 * speed, integral_scale_mm=1.0 * size, smallest_mm=1.2 * size, modes=200)
         still = Uniform(displacement_mm=(0.0, 0.0, 0.0))
         return TurbulentFlow(still, law.realisation(seed=[case.seed, 41]))
+    if case.flow == "abc":
+        return Abc(ABC_MM * case.speed, SIZE_MM[case.scale][0])
     raise ValueError(f"flow: expected one of {', '.join(FLOWS)}, got {case.flow!r}.")
+
+
+@dataclass(frozen=True)
+class Abc:
+    """Flow of Arnold, Beltrami and Childress."""
+
+    amplitude_mm: float
+    wave_mm: float
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        x, y, z = np.asarray(points_mm, float).T * (2 * np.pi / self.wave_mm)
+        sums = (np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x))
+        return self.amplitude_mm * np.stack(sums, axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -281,6 +304,12 @@ def _light(
     """Return the light of each particle in each camera (camera, n), at each frame."""
     scatter, count = condition.brightness, len(positions[0])
     equal = scatter.of_diameters(scatter.diameters(count, rng)) * scatter.of_cameras(cameras, count, rng)
+    if condition.dark or condition.flicker:
+        draw, frames = rng.random(count), []
+        for frame in range(len(positions)):
+            lit = draw > condition.dark if frame == 0 else draw < 1 - condition.dark
+            frames.append(equal * lit * np.exp(condition.flicker * rng.standard_normal(count)))
+        return tuple(frames)
     if condition.sheet is None:
         return (equal,) * len(positions)
     thickness, second = condition.sheet

@@ -84,7 +84,7 @@ def by_smart(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> Measu
     """Reconstruct each frame by SMART, as `lfpiv run` does."""
     smart = Smart(**table_of(settings, "smart"))
     guard = settings.get("volume.guard_mm", "auto")
-    guarded = rig.grid.padded(_guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
+    guarded = rig.grid.padded(guard_layers(rig, recorded) if guard == "auto" else rig.grid.layers(guard))
     size = particle_size(rig, recorded)
     factor = needed_refinement(size) if smart.refinement == "auto" else float(smart.refinement)
     weights = weights_of(rig, guarded.refined(factor), (size or 0.0) * factor)
@@ -173,7 +173,7 @@ def table_of(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=64)
-def _guard_layers(rig: Rig, recorded: Recorded) -> Layers:
+def guard_layers(rig: Rig, recorded: Recorded) -> Layers:
     """Return the guard layers that the images demand, as a run finds them."""
     light = [{name: rig.light(name, image) for name, image in images.items()} for images in recorded.images]
     counts = [[LEAST_LAYERS, LEAST_LAYERS] for _ in range(3)]
