@@ -26,7 +26,7 @@ from lfpiv.runs import background, guard, refinement, summary
 from lfpiv.runs.background import Background
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.moved_cameras import MovementFigures, SelfCalibrationFigures
-from lfpiv.runs.pair_figures import MotionFigures, PairFigures, Spread
+from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.runs.refinement import Refinement
 from lfpiv.warn import Code, Warning
 
@@ -119,7 +119,6 @@ FIGURES = PairFigures(
     velocity_m_per_s={"u": Spread(mean=0.1, sd=0.2, min=None, max=1.0)},
     uncertainty_voxel=None,
     peak_ratio=2.0,
-    motion=MotionFigures(verdict="followed", followed=True, valid_fraction=[0.5]),
     residual={"a": [0.9, 0.5]},
     structure={"a": {"left": 0.5}},
     stop={"a": "iteration limit reached"},

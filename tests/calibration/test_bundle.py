@@ -103,6 +103,7 @@ def test_a_perfect_board_is_not_corrected(cameras, optics):
     assert (found.plane_std[:, 2] > 0).all()  # what the labels could have shown
 
 
+@pytest.mark.slow(but="two cameras-aberrated")
 @pytest.mark.parametrize("optics", ["ideal", "aberrated"])
 @pytest.mark.parametrize("cameras", ANGLES)
 @pytest.mark.parametrize("dots_mm", [0.0, 0.005])

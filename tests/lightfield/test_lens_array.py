@@ -127,6 +127,7 @@ def test_integer_pitch_without_rotation_is_not_locked_to_pixels(square):
         assert worst_error(find_lens_array(white), origin, basis) < TOLERANCE_INTEGER
 
 
+@pytest.mark.slow(but="1.0-True")
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 @pytest.mark.parametrize("whole_lenses", [True, False])
 @pytest.mark.parametrize("fill", [0.8, 1.0, 1.06])
@@ -308,6 +309,7 @@ def test_sample_rig_is_recovered(sample_data, name, offset_mm, roll_deg):
     assert array.rms_px < 0.03
 
 
+@pytest.mark.slow(but="None")
 @pytest.mark.sample_data
 @pytest.mark.parametrize("error", [None, 0.9, 1.1])
 @pytest.mark.parametrize(

@@ -63,6 +63,7 @@ def form(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.slow(but="zarr-dask")
 def test_a_store_is_the_folder(run, form, dask):
     (path,) = lfpiv.export_results(run, form)
     folder, store = lfpiv.open_results(run), lfpiv.open_results(path)
@@ -96,6 +97,7 @@ def test_a_store_of_pairs_has_times_if_the_interval_is_known(tmp_path, form):
     assert lfpiv.open_results(path).time.values.tolist() == [0.25 * number for number in NUMBERS]
 
 
+@pytest.mark.slow(but="pairs")
 def test_chunks_suit_a_point_and_a_field(run, form):
     (path,) = lfpiv.export_results(run, form)
     chunks = [sizes[0] for sizes in lfpiv.open_results(path).u.chunksizes.values()]
@@ -139,6 +141,7 @@ def test_results_of_other_settings_replace_the_store(tmp_path):
     assert json.loads(store.attrs["smart"]) == {"iterations": 5} and store.sizes["pair"] == 3
 
 
+@pytest.mark.slow(but="pairs")
 def test_a_killed_export_is_no_complete_store_and_goes_on(run, form, monkeypatch):
     monkeypatch.setattr(stores, "CHUNK_PAIRS", 2)
     inner = stacked_files.StackedFiles.block
@@ -254,6 +257,7 @@ def put_pipe(path):
     os.mkfifo(chunk)
 
 
+@pytest.mark.slow(but="change_values-True")
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("forge", [change_values, change_interval, change_copy, remove_chunk, put_pipe])
 def test_a_forged_store_is_refused_and_written_anew(tmp_path, form, forge, whole, monkeypatch):
@@ -292,6 +296,7 @@ def state(store, name, change):
     (store / ".zmetadata").write_text(json.dumps(every))
 
 
+@pytest.mark.slow(but="x-change0")
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
@@ -332,6 +337,7 @@ def test_a_store_holds_nothing_but_its_arrays(tmp_path, other):
         lfpiv.open_results(path)
 
 
+@pytest.mark.slow(but="pair/0")
 @pytest.mark.parametrize("torn", ["u/1.0.0.0", "pair/0", "u/.zarray", "x/.zattrs"])
 def test_an_unfinished_store_with_torn_files_is_finished(tmp_path, torn, monkeypatch):
     pytest.importorskip("zarr")
@@ -346,7 +352,7 @@ def test_an_unfinished_store_with_torn_files_is_finished(tmp_path, torn, monkeyp
     xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
 
 
-@pytest.mark.slow(but="zarr")
+@pytest.mark.slow(but="netcdf")
 def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypatch):
     """HDF5 would crash the process. No disk, but files that may not grow: all of them, or only the last bytes."""
     write_run(tmp_path, NUMBERS)

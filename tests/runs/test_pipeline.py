@@ -240,14 +240,13 @@ def test_figures_come_from_the_files_without_reading_them(finished, monkeypatch)
 def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, monkeypatch):
     out = small_run.results(tmp_path / "out")
     shutil.rmtree(out / "vectors")
-    correlate = lfpiv.correlate
 
-    def fail(first, second, **settings):
-        if first.attrs["pair"] == 1:
+    def fail(volumes, **settings):
+        if volumes[0].attrs["pair"] == 1:
             raise RuntimeError("the power went off")
-        return correlate(first, second, **settings)
+        return lfpiv.correlate(*volumes, **settings)
 
-    monkeypatch.setattr("lfpiv.runs.pair_vectors.correlate", fail)
+    monkeypatch.setattr("lfpiv.runs.pair_vectors.joint_vectors", fail)
     monkeypatch.setattr(netcdf, "read_volume", numbered(netcdf.read_volume))
     result = pipeline.correlate(small_run.experiment, out)
     assert result["failed"] == [{"pair": 1, "reason": "unexpected RuntimeError: the power went off"}]
