@@ -288,6 +288,7 @@ def set_attribute(name, value):
     return change
 
 
+@pytest.mark.slow
 @FEWER
 @given(
     name=st.sampled_from(
