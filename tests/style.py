@@ -360,7 +360,7 @@ def page_texts(path):
     yield re.sub(r"^```.*?^```\s*$|\$\$.*?\$\$", "\n\n", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
-RULES = (imports, circles, taichi, kernel_arguments, tests)
+RULES = (imports, circles, taichi, kernel_arguments, tests, sentences)
 
 
 def broken():

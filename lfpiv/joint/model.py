@@ -4,7 +4,7 @@ With the light c of voxels midway in time, their displacement d and s = -1, +1 f
 is ``E_f = G' T(s d / 2) c exp(s rho) g_f``. T moves each voxel's light and spreads it as a cubic B-spline
 (`lfpiv_kernels.reconstruction.transport`). G' is the Gaussian that makes the sieve of that spread. g_f is the power of
 the frame's laser. rho is 0 unless particles are lost between the frames: half of the smooth logarithm of the second
-frame's brightness over that of the first one.
+frame's brightness over the first frame's.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ class PairSolver:
         if len(images) != 2 or len(floors) != 2:
             raise ValueError(f"images, floor: expected two frames, got {len(images)} and {len(floors)}.")
         if len(masks) != 2:
-            raise ValueError(f"mask: expected one, or one of each frame, got {len(masks)}.")
+            raise ValueError(f"mask: expected one for both frames, or two, got {len(masks)}.")
         alone = ALONE_SHARE if self.estimate == "joint" else 1.0
 
         def step(start: float, end: float, fraction: float) -> None:

@@ -68,7 +68,7 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     Dataset
         As `correlate` returns it. ``joint`` is true where the vector is the mean of the fitted displacement over the
         window, false where the frames by themselves contradict it and the vector is that of their correlation.
-        ``uncertainty_z``, ``_y``, ``_x`` of the former ones are those of the frames by themselves, lowered as the fit
+        ``uncertainty_z``, ``_y``, ``_x`` of the former are those of the frames by themselves, lowered as the fit
         lowers the error, and what is left between these frames.
         ``valid`` is that of their correlation. ``correlation`` and ``peak_ratio`` are those of the frames by
         themselves, deformed by the fitted displacement.

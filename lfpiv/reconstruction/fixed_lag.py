@@ -49,7 +49,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     own : Reconstruction
         The instant from its images and the instants before it.
     others : mapping of int to Reconstruction
-        Number of instants from each to the present one, negative for later ones -> the instant.
+        Number of instants from each to the present instant, negative for later ones -> the instant.
     flow : Dataset
         From `mean_flow`: displacement from one instant to the next [voxel of the vectors' volumes].
 

@@ -54,8 +54,8 @@ class PreparedInstant:
         """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
 
         `whole_passes` is the number of passes over all rays after those over subsets; default: that of the subsets. A
-        `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first one, whose
-        misfit is then the sum over the subsets, and that after the last one, whose misfit is then NaN.
+        `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first epoch, whose
+        misfit is then the sum over the subsets, and after the last epoch, whose misfit is then NaN.
         """
         settings, normalisation = self.settings, self.normalisation
         state = self._start(duplicate(self._from_images) if first is None else self._given(first))

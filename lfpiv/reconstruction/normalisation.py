@@ -264,7 +264,7 @@ def joint_lengths(weights: Weights, subsets: tuple[Subset, ...]) -> tuple[tuple[
 
     With the share r_n of subset n in the light of all, its step is a_n / (s q), a_n = N / max(N r_n, 1), where q is the
     largest quotient max(N s_n / s, 1) / max(N r_n, 1) of all subsets. It is little more than 1 for most voxels. Sums of
-    all cameras are nowhere a larger part than those of one of them, so brightnesses of cameras do not matter.
+    all cameras are nowhere a larger part than the sums of a single camera, so brightnesses of cameras do not matter.
 
     Returns
     -------

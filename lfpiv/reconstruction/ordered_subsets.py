@@ -67,9 +67,9 @@ FOLLOWING_TIME = 8.0
 than plain ones. The time is 1 where there is no sieve and subsets are of lenses: longer steps by these follow the
 noise."""
 SHORTENING = 0.05
-"""Steps of epoch k are 1 / (1 + k SHORTENING) as long as those of the first one."""
+"""Steps of epoch k are 1 / (1 + k SHORTENING) as long as in the first epoch."""
 CONFLICT = 0.5
-"""Agreement of subsets of one camera each below which the next epochs take larger ones: half that of independent
+"""Agreement of subsets of one camera each below which the next epochs take larger subsets: half that of independent
 exponents."""
 JOINT_CONFLICT, POINT_CONFLICT = 0.1, 0.5
 """Agreement of subsets of all cameras below which the passes over all rays follow, with a sieve and without."""

@@ -73,7 +73,7 @@ class Reconstruction:
     def continued_by(self, after: Reconstruction) -> Reconstruction:
         """Return a later reconstruction that started from this one, with the history of both.
 
-        It keeps this one's reason to stop, unless the later one diverged: a later one is short by design.
+        It keeps the earlier reason to stop, unless the later result diverged: the later run is short by design.
         """
         stop = after.stop if after.stop is SmartStop.DIVERGED else self.stop
         residual, misfit = self.residual[:-1] + after.residual, self.misfit[:-1] + after.misfit

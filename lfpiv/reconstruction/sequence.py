@@ -9,7 +9,7 @@ The guess is the product of powers M^p F^(1 - p) of the moved volume M and the g
 exponent p = `PERSISTENCE` where the flow is known, and 0 elsewhere. SMART multiplies its first guess, so what the
 images do not determine is forgotten by the factor p in each instant. Particles that enter through a face come from F.
 
-So the volumes go forward in time. Afterwards each is corrected by those of the instants on both sides of it
+So the volumes go forward in time. Afterwards each is corrected by the volumes on both sides of it
 (`lfpiv.reconstruction.fixed_lag`), which changes no other one.
 
 .. [1] M. Novara, K. J. Batenburg, F. Scarano, "Motion tracking-enhanced MART for tomographic PIV", Meas. Sci. Technol.
@@ -49,7 +49,7 @@ FLOW_MEMORY = 0.7
 FIRST_SHARE = 0.35
 """Iterations of an instant that starts from its images, as a share of those of an instant by itself."""
 ITERATION_SHARE = 0.2
-"""Iterations of an instant that starts from the one before, as a share of those of an instant by itself."""
+"""Iterations of a predicted instant over iterations of an independent instant."""
 SHARE_SUBSETS = 4
 """Number of subsets up to which `ITERATION_SHARE` holds. With more subsets, fewer iterations make as many steps."""
 DIMMEST = 0.05

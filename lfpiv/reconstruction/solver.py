@@ -103,7 +103,7 @@ class SmartSolver:
     def _normalisation(
         self, camera_gains: dict[str, float], sieve: Sieve, solid: np.ndarray | None
     ) -> LensSubsets | RowSubsets:
-        """Return what all instants with these brightnesses, sieve and mask share; that of the last ones is kept."""
+        """Return what all instants with these brightnesses, sieve and mask share; the last is kept."""
         key = (*camera_gains.values(), sieve)
         if self._last is None or self._last[0] != key or not _same(self._last[1], solid):
             kind = RowSubsets if self.weights.rows > 1 and len(self.subsets) > 1 else LensSubsets

@@ -34,8 +34,8 @@ class StoredGrid:
     ) -> StoredGrid:
         """Choose the order by how far 1 mm along each axis moves a point's image.
 
-        The axis with the largest movement across the sensors' rows is the outermost one. Of the other two, the one with
-        the larger movement across the columns is the middle one, or the innermost one for `columns_inmost`.
+        The axis with the largest movement across the sensors' rows is the outermost one. Of the other two, the axis
+        with the larger movement across the columns is the middle axis, or the innermost one for `columns_inmost`.
         """
         centre = [
             first + (n - 1) / 2 * grid.voxel_mm for first, n in zip(grid.first_centre_mm, grid.shape, strict=True)

@@ -2,7 +2,7 @@
 
 Voxels that lie along a row meet lines of sight that lie along the same row, a voxel apart, some part of a voxel aside.
 The image of a voxel, as a function of its place on the row, is smooth only as far as particles are: sums of voxels that
-make a blob are interpolated well, a single voxel is not. So the shares are the best ones for a blob: those of universal
+make a blob are interpolated well, a single voxel is not. So the shares are the best for a blob: those of universal
 kriging [1]_ with a Gaussian autocovariance, exact for images that change linearly with the place.
 
 .. [1] N. Cressie, "Statistics for spatial data", Wiley 1993, section 3.4, doi:10.1002/9781119115151.
