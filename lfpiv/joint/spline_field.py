@@ -63,11 +63,15 @@ class SplineField:
 
     def values(self, nodes: np.ndarray) -> np.ndarray:
         """Return the displacement of each voxel, shape (3, z, y, x), float32."""
-        return np.ascontiguousarray(_along_axes(self._voxels, nodes), dtype=np.float32)
+        z, y, x = self._voxels
+        rows = _along_axes([z, y], nodes).astype(np.float32)
+        return np.ascontiguousarray(rows @ x.T.astype(np.float32))
 
     def adjoint(self, values: np.ndarray) -> np.ndarray:
         """Return the adjoint of `values`, shape of the nodes."""
-        return _along_axes([matrix.T for matrix in self._voxels], values.astype(np.float64))
+        z, y, x = self._voxels
+        rows = values.astype(np.float32, copy=False) @ x.astype(np.float32)
+        return _along_axes([z.T, y.T], rows.astype(np.float64))
 
     def values_on(self, nodes: np.ndarray, grid: Grid) -> np.ndarray:
         """Return the displacement at the voxels of another grid [voxel of that grid], shape (3, z, y, x), float32."""
@@ -132,7 +136,7 @@ def window_shares(voxels_mm: np.ndarray, centres_mm: np.ndarray, edge_mm: float)
 
 
 def _along_axes(matrices: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
-    """Apply a matrix along each of the last three axes of values, shape (3, z, y, x)."""
+    """Apply a matrix along each of the first axes z, y, x of values, shape (3, z, y, x)."""
     for axis, matrix in enumerate(matrices, start=1):
         values = np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
     return values

@@ -31,6 +31,9 @@ BYTES_PER_VOXEL_AND_CAMERA = LEAST_BYTES_PER_CAMERA
 """Memory per voxel and camera that is kept [byte]: sums of the weights of all and of half of the lenses, step sizes of
 these."""
 
+JOINT_BYTES = 60
+"""Memory per voxel that a joint fit needs beyond the correlation [byte]: both frames by themselves, displacement."""
+
 BYTES_PER_PIXEL = 72
 """Memory per sensor pixel [byte]: images, those of the next pair, light-field blocks, the decoder's arrays."""
 
@@ -69,6 +72,7 @@ def worker_bytes(experiment: Experiment) -> int:
 def _volumes_bytes(experiment: Experiment) -> int:
     """Estimate the memory of a process for what it has of each voxel, but the weights [byte]."""
     each = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * len(experiment.cameras)
+    each += JOINT_BYTES * (experiment.smart.estimate == "joint")
     return each * experiment.grid.size
 
 
