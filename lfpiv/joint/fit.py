@@ -47,8 +47,10 @@ ROUNDS = (
 SETTLED_VOXEL = 0.02
 """Mean change of the displacement below which no other round follows [voxel]."""
 LOST, JUDGED = 3.2, 2
-"""Misfit over that of the frames by themselves, after so many rounds, above which particles are lost between frames.
-The fit then begins again with brightness that may differ."""
+"""Misfit over that of the frames by themselves, after so many rounds, above which particles may be lost between frames.
+"""
+UNEQUAL = 0.13
+"""Rms of rho, weighted by the light, above which they are: the fit begins again with brightness that may differ."""
 PART = 2
 """The curvature is that of one subset of the rays in so many."""
 
@@ -106,11 +108,22 @@ def fit_pair(
         if progress is not None:
             progress(done / (len(ROUNDS) + JUDGED))
         if number == JUDGED and ratio > LOST and model.sieve_voxel > 0 and model.rho is None:
-            model.rho, nodes, number = np.zeros_like(model.lit), first, 0
+            model.rho = _loss(model, found, nodes)
+            if model.rho is not None:
+                nodes, number = first, 0
         if not now.fresh and moved < SETTLED_VOXEL:
             break
     residual = movement.residual(light.values, model.transports(nodes))
     return JointFit(light.values, nodes, done, residual.misfit / alone, model.rho is not None, residual)
+
+
+def _loss(model: JointModel, found: Sequence[Reconstruction], nodes: np.ndarray) -> np.ndarray | None:
+    """Return rho from the frames by themselves; None if they are about equally bright."""
+    model.rho = np.zeros_like(model.lit)
+    light = model.start(found, nodes)
+    rms = float(np.sqrt((light * model.rho**2).sum(dtype=np.float64) / light.sum(dtype=np.float64)))
+    log.debug("brightness of the frames differs by %.3f", rms)
+    return model.rho if rms > UNEQUAL else None
 
 
 def _curvature_rays(steps: LightSteps, cameras: int) -> Subset:
