@@ -216,6 +216,7 @@ def test_the_demonstration_ends_with_warnings_and_three_aligned_lines(tmp_path, 
     assert "0.23 voxel" in lines[1] and "2.7 voxel" in lines[1] and str(tmp_path / "report.html") in lines[2]
 
 
+@pytest.mark.slow
 def test_options_of_one_call_do_not_reach_the_next(capfd):
     assert commands.call(["doctor", "--json"]) == 0
     found = json.loads(capfd.readouterr().out)

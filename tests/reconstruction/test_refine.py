@@ -68,6 +68,7 @@ def test_misfits_of_some_rays_stand_for_those_of_all(recorded, sieve_voxel):
         assert found.residual[1] == pytest.approx(norm(after), rel=TOLERANCE_SAMPLE)
 
 
+@pytest.mark.slow(but="voxels")
 @pytest.mark.parametrize("sieve_voxel", SIEVES)
 def test_the_truth_is_a_fixed_point(recorded, sieve_voxel):
     weights, truth, _ = recorded

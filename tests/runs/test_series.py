@@ -118,10 +118,8 @@ def test_each_instant_is_read_and_reconstructed_once_and_two_volumes_are_held(
     assert len(held) == INSTANTS - step and 1 <= min(held) and max(held) <= 2
 
 
-@pytest.mark.parametrize(
-    ("step", "workers", "instants"),
-    [(1, 2, 6), pytest.param(1, 3, 6, marks=pytest.mark.slow), pytest.param(2, 2, 8, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("step", "workers", "instants"), [(1, 3, 6), (2, 2, 8)])
 def test_several_workers_reconstruct_each_instant_once_with_equal_numbers(
     made, reference, tmp_path, solved, step, workers, instants
 ):
