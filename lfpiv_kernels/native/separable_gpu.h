@@ -197,8 +197,8 @@ LFPIV_INLINE void return_across(const SeparableArrays& in, int warp, const float
 }
 
 /// Add to 32 voxels the light of lines: the adjoint of `sum_down`. With `lit` all weights count as 1.
-LFPIV_INLINE void return_down(const SeparableArrays& in, int warp, const float* lines, const RayRows& rows,
-                              bool lit, float* volume_out) {
+LFPIV_INLINE void return_down(const SeparableArrays& in, int warp, const float* lines, const RayRows& rows, bool lit,
+                              float* volume_out) {
     for_lanes([&](int lane) {
         const int number = warp * LANES_OF_WARP + lane, column = number % in.columns;
         const int at_row = number / in.columns, row = at_row % in.rows, plane = at_row / in.rows;
