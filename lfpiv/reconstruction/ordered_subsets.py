@@ -239,44 +239,77 @@ def iterate_epochs(
     """
     coefficients = duplicate(state.coefficients)
     momentum = Momentum(duplicate(coefficients), time, SUBSET_MOMENTUM)
-    partition, following = partitions[0], list(partitions[1:])
-    safely, before = False, math.inf
+    course = _Course(partitions)
     for epoch in range(epochs):
-        steps = partition.safer if safely and partition.safer else partition.steps
         if epoch and left_out > 0:
             leave_out(coefficients, momentum, left_out)
-        length = 1 / (1 + SHORTENING * epoch)
-        start = duplicate(coefficients)
+        partition, start = course.partition, duplicate(coefficients)
         agreement = Agreement(start) if partition.conflict > 0 and epoch + 1 < epochs else None
         equations.begin()
-        lengths = partition.lengths or (1.0,) * len(steps)
-        for subset, step, of_subset in zip(partition.subsets, steps, lengths, strict=True):
+        for subset, step, length in course.steps(1 / (1 + SHORTENING * epoch)):
             exponent = equations.exponent_of(subset.parts, sieve(coefficients))
             if agreement is not None:
                 agreement.add(exponent)
-            coefficients, after = step(coefficients, exponent, momentum, length=length * of_subset, in_place=True)
+            coefficients, after = step(coefficients, exponent, momentum, length=length, in_place=True)
             assert after is not None  # with a momentum there is one after it
             momentum = after
-        misfit, count = equations.measured(), len(partition.subsets)
-        rose = not misfit.divergence <= before  # true for NaN
+        misfit = equations.measured()
+        rose = course.rises(misfit)
         if rose:
             coefficients, momentum = start, Momentum(duplicate(start), largest=SUBSET_MOMENTUM)
-        may_be_safer = bool(partition.safer) and not safely
-        is_last = rose and not may_be_safer and not following
-        yield Epoch(State(coefficients, momentum, state.steps), misfit, count, rose, undone=rose and not is_last)
-        if is_last:
-            log.debug("epoch %d: misfit rises, whole passes follow", epoch + 1)
+        undone = rose and course.can_change
+        yield Epoch(State(coefficients, momentum, state.steps), misfit, len(partition.subsets), rose, undone)
+        if not course.goes_on(misfit, rose, agreement):
             return
-        if rose and may_be_safer:
-            log.debug("epoch %d: misfit rises, safer steps follow", epoch + 1)
-            safely = True
-            continue
+
+
+class _Course:
+    """Which subsets and steps make an epoch, and what follows it.
+
+    Parameters
+    ----------
+    partitions : sequence of Partition
+        As of `iterate_epochs`.
+    """
+
+    def __init__(self, partitions: Sequence[Partition]):
+        self.partition, self._following = partitions[0], list(partitions[1:])
+        self._safely, self._before = False, math.inf
+
+    def steps(self, length: float) -> Iterator[tuple[Subset, Step, float]]:
+        """Yield each subset with its step and the factor of its exponent."""
+        partition = self.partition
+        steps = partition.safer if self._safely and partition.safer else partition.steps
+        lengths = partition.lengths or (1.0,) * len(steps)
+        for subset, step, own in zip(partition.subsets, steps, lengths, strict=True):
+            yield subset, step, length * own
+
+    @property
+    def can_change(self) -> bool:
+        """Whether safer steps or larger subsets can follow an epoch whose misfit rose."""
+        return self._may_be_safer or bool(self._following)
+
+    @property
+    def _may_be_safer(self) -> bool:
+        return bool(self.partition.safer) and not self._safely
+
+    def rises(self, misfit: Misfit) -> bool:
+        """Return whether the misfit of an epoch is larger than that of the epoch before by the same subsets."""
+        return not misfit.divergence <= self._before  # true for NaN
+
+    def goes_on(self, misfit: Misfit, rose: bool, agreement: Agreement | None) -> bool:
+        """Choose subsets and steps of the next epoch; return whether there is one."""
+        if rose and self._may_be_safer:
+            log.debug("misfit rises, safer steps follow")
+            self._safely = True
+            return True
         if not rose:
-            before = misfit.divergence
-        if rose or (agreement is not None and agreement.measured() < partition.conflict):
-            larger = bool(following) and len(following[0].subsets) > 1
-            why, what = "misfit rises" if rose else "subsets conflict", "larger subsets" if larger else "whole passes"
-            log.debug("epoch %d: %s, %s follow", epoch + 1, why, what)
-            if not larger:
-                return
-            partition, before = following.pop(0), math.inf
+            self._before = misfit.divergence
+            if agreement is None or not agreement.measured() < self.partition.conflict:
+                return True
+        larger = bool(self._following) and len(self._following[0].subsets) > 1
+        why, what = "misfit rises" if rose else "subsets conflict", "larger subsets" if larger else "whole passes"
+        log.debug("%s, %s follow", why, what)
+        if larger:
+            self.partition, self._before = self._following.pop(0), math.inf
+        return larger
