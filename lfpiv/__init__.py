@@ -42,6 +42,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.runs.pipeline import run as run
     from lfpiv.selfcalibration.movements import self_calibrate as self_calibrate
     from lfpiv.tracking.finding import find_particles as find_particles
+    from lfpiv.tracking.link_vectors import vectors_from_links as vectors_from_links
     from lfpiv.tracking.linking import link_particles as link_particles
     from lfpiv.velocity.cross_correlation import correlate as correlate
     from lfpiv.weights.operator import build_weights as build_weights
@@ -76,6 +77,7 @@ _MODULES = {
     "run": "lfpiv.runs.pipeline",
     "self_calibrate": "lfpiv.selfcalibration.movements",
     "thin_lens": "lfpiv.calibration.cameras",
+    "vectors_from_links": "lfpiv.tracking.link_vectors",
     "volume_on": "lfpiv.geometry.resampling",
     "write_report": "lfpiv.report",
 }

@@ -300,7 +300,12 @@ class Experiment(Shown):
     @property
     def simulated_pairs(self) -> int:
         """Number of pairs that are simulated to measure the damping by ghosts; 0 for none."""
-        return self.bootstrap.count(self.pairs)
+        return 0 if self.by_links else self.bootstrap.count(self.pairs)
+
+    @property
+    def by_links(self) -> bool:
+        """Whether vectors are those of linked particles. Ghosts do not damp them."""
+        return self.tracking is not None and self.tracking.gives_vectors(len(self.cameras))
 
     def frame_images(self, frame: Frame) -> list[ImagePath]:
         """Return the images of one frame, in the order of the cameras."""

@@ -169,6 +169,8 @@ def of_pair(
     both_frames = experiment.pair_frames(pair)
     of_pair = parts | {"images": look_at(experiment.pair_images(pair), start)} | _mask_files(experiment, both_frames)
     of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    if experiment.by_links and experiment.tracking is not None:
+        of_vectors["links"] = experiment.tracking.search
     if experiment.series is None:
         volumes = Stamp(of_pair)
         return PairStamps(

@@ -38,6 +38,7 @@ from lfpiv.runs.particles import FrameFits, refused, track
 from lfpiv.runs.sequences import SequentialInstants
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
+from lfpiv.tracking.link_vectors import vectors_from_links
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import FirstOfEachCode, Warning
 
@@ -343,12 +344,36 @@ class PairWork:
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         return vectors
 
+    def measured(self, files: PairFiles, volumes: PairVolumes) -> tuple[xr.Dataset, xr.Dataset | None]:
+        """Return the vectors of a pair, and its linked particles if they are wanted.
+
+        Vectors are those of the links where these resolve the flow better.
+
+        Raises
+        ------
+        InputError
+            If an image cannot be read again.
+        """
+        vectors = self.vectors_between(files.pair, volumes)
+        if files.particles is None or self.weights is None:
+            return vectors, None
+        start = time.perf_counter()
+        light = [self.light_again(file.frame) for file in files.frames]
+        table, found = track(self.search, self.fits, light, volumes, vectors)
+        if vectors.attrs["verdict"] in REFUSED:
+            table = refused(table)
+        elif self.experiment.by_links:
+            vectors = vectors_from_links(vectors, table)
+            vectors.attrs["correlation_s"] += time.perf_counter() - start
+        vectors.attrs["warnings"] = warn.to_text((*volumes.warnings, *found))
+        return vectors, table
+
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
-        experiment, vectors = self.experiment, self.vectors_between(files.pair, volumes)
-        condensed, found = volumes.condensed(), volumes.warnings
-        if files.particles is not None and self.weights is not None:
-            found = (*found, *self._track(files, volumes, vectors))
-            vectors.attrs["warnings"] = warn.to_text(found)
+        experiment, condensed = self.experiment, volumes.condensed()
+        vectors, table = self.measured(files, volumes)
+        found = warn.from_text(vectors.attrs["warnings"])
+        if table is not None:
+            self._keep_particles(files, table, found[len(volumes.warnings) :])
         figures = pair_figures.measure(vectors, condensed, found)
         self._log(files.pair, volumes.between)
         if figures.verdict not in (*REFUSED, Verdict.GOOD.value):
@@ -371,12 +396,9 @@ class PairWork:
 
         self.write(write)
 
-    def _track(self, files: PairFiles, volumes: PairVolumes, vectors: xr.Dataset) -> list[Warning]:
-        """Find and link the particles of both frames and write them; return the warnings about them."""
-        light = [self.light_again(file.frame) for file in files.frames]
-        table, found = track(self.search, self.fits, light, volumes, vectors)
-        if vectors.attrs["verdict"] in REFUSED:
-            table = refused(table)
+    def _keep_particles(self, files: PairFiles, table: xr.Dataset, found: Iterable[Warning]) -> None:
+        """Write the linked particles of a pair, and log their figures and the warnings about them."""
+        assert files.particles is not None
         self.write(partial(files.write_particles, table))
         name, linked = self.experiment.name_of(files.pair), table.sizes["particle"]
         log.info(
@@ -390,7 +412,6 @@ class PairWork:
             100 * np.mean(table.attrs["explained"]),
         )
         self._log(files.pair, found)
-        return found
 
     @cached_property
     def fits(self) -> FrameFits:
@@ -401,7 +422,7 @@ class PairWork:
     def search(self) -> ParticleSearch:
         """Search for particles of this rig, made once for all pairs."""
         assert self.weights is not None and self.experiment.tracking is not None
-        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.model_dump())
+        return ParticleSearch(self.weights, self.experiment.grid, **self.experiment.tracking.search)
 
 
 def _with_next(pairs: Iterable[int]) -> Iterator[tuple[int, int | None]]:

@@ -14,6 +14,7 @@ from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.fit import Fit
+from lfpiv.tracking.link_vectors import LEAST_LINKED
 from lfpiv.tracking.linking import link_particles
 from lfpiv.tracking.pairing import exchange
 from lfpiv.warn import Code, Warning
@@ -21,8 +22,6 @@ from lfpiv.warn import Code, Warning
 HIDDEN, HIDDEN_ONE = 0.5, 0.14
 """Share of particles that fewer than two cameras see alone above which particles are mixed up; the second of those that
 a single camera does not see alone."""
-LEAST_LINKED = 0.65
-"""Least share of the found particles that are linked, without a warning. Ghosts in two frames have no partners."""
 LEAST_FOUND = 20
 """Least number of particles in a frame that this share is judged by."""
 

@@ -90,13 +90,25 @@ class Correlation(Table):
 
 
 class Tracking(Table):
-    """Table ``[tracking]``: vectors of single particles beside the correlation; absent: none."""
+    """Table ``[tracking]``: displacements of single particles beside the correlation; absent: none."""
 
     rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
     """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm
     them, and added where light is left."""
     weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     """Least light of a particle in each camera that counts, as a share of the typical particle's."""
+    vectors: Literal["auto", "links", "correlation"] = "auto"
+    """Whether a pair's vectors are means of its linked particles' flow, or those of the correlation; "auto" takes links
+    where a single camera is used, which resolves depth worse by correlation."""
+
+    def gives_vectors(self, cameras: int) -> bool:
+        """Return whether links give the vectors of a rig with a number of cameras."""
+        return self.vectors == "links" or (self.vectors == "auto" and cameras == 1)
+
+    @property
+    def search(self) -> dict[str, Any]:
+        """The settings of the search for particles."""
+        return self.model_dump(exclude={"vectors"})
 
 
 Nodes = Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_NODES)]

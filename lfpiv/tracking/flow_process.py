@@ -6,9 +6,9 @@ resolves. Components of the flow u have the mean 0 after the links' mean is subt
     independent:     s^2 exp(-r^2 / 2 l^2) I
     incompressible:  s^2 [(1 - r^2 / 2 l^2) I + r r' / 2 l^2] exp(-r^2 / 2 l^2)
 
-or their mean over the lengths l / 2, l, 2 l. Strength s, length l, and the unresolved scatter maximise the evidence of
-the links [2]_; so does the choice among the four forms. Links that disagree with the process lose weight (Cauchy).
-Of a single camera's links, depth is many times less certain than the other components, which incompressibility shares.
+Strength s, length l, and the unresolved scatter maximise the evidence of the links [2]_; so does the choice between
+both forms. Links that disagree with the process lose weight (Cauchy). The links of a single camera show depth many
+times less precisely than the other components, which tell about it where the flow is incompressible.
 
 References
 ----------
@@ -40,8 +40,6 @@ START = (1.0, 12.0, 0.05)
 """Strength, length and scatter from which the evidence is maximised [voxel]."""
 MEAN = 3.0
 """Standard deviation of the flow's mean about the mean of the links [voxel]: so large that it tells nothing."""
-MIXED = (0.5, 1.0, 2.0)
-"""Lengths of a mixed process over its length."""
 CAUCHY = 2.5
 """Residual at which a link counts half [standard deviation]."""
 ROUNDS = 3
@@ -58,9 +56,6 @@ POINTS = 4
 """Points along each edge of a window whose mean is taken."""
 JITTER = 1e-10
 
-FORMS = ((False, False), (False, True), (True, False), (True, True))
-"""Incompressible or not, mixed or not."""
-
 
 class FlowCovariance(Kernel):  # type: ignore[misc]
     """Covariance of links, for `sklearn.gaussian_process`.
@@ -75,27 +70,28 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
         length: float = START[1],
         scatter: float = START[2],
         incompressible: bool = False,
-        mixed: bool = False,
     ):
         self.strength = strength
         self.length = length
         self.scatter = scatter
         self.incompressible = incompressible
-        self.mixed = mixed
 
     @property
     def hyperparameter_length(self) -> Hyperparameter:
+        """Bounds of the length, for scikit-learn."""
         return Hyperparameter("length", "numeric", LENGTHS)
 
     @property
     def hyperparameter_scatter(self) -> Hyperparameter:
+        """Bounds of the scatter, for scikit-learn."""
         return Hyperparameter("scatter", "numeric", SCATTERS)
 
     @property
     def hyperparameter_strength(self) -> Hyperparameter:
+        """Bounds of the strength, for scikit-learn."""
         return Hyperparameter("strength", "numeric", STRENGTHS)
 
-    def __call__(self, X: np.ndarray, Y: np.ndarray | None = None, eval_gradient: bool = False) -> Any:  # noqa: N803
+    def __call__(self, X: np.ndarray, Y: np.ndarray | None = None, eval_gradient: bool = False) -> Any:
         """Return the covariance, and with `eval_gradient` its derivatives by the logarithms of the parameters."""
         other = X if Y is None else Y
         smooth, by_length = self.smooth(X, other)
@@ -117,20 +113,18 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
         apart = (a[: len(a) // 3, None, :3] - b[None, : len(b) // 3, :3]).transpose(2, 0, 1)
         square = np.square(apart).sum(0)
         value, slope = (np.zeros((3, len(a) // 3, 3, len(b) // 3)) for _ in range(2))
-        lengths = [self.length * one for one in MIXED] if self.mixed else [self.length]
-        for length in lengths:
-            scaled = square / length**2
-            bell = self.strength**2 / len(lengths) * np.exp(-scaled / 2)
-            for i in range(3):
-                value[i, :, i] += bell * (1 - scaled / 2) if self.incompressible else bell
-                slope[i, :, i] += bell * scaled * (2 - scaled / 2) if self.incompressible else bell * scaled
-                for j in range(3) if self.incompressible else ():
-                    shared = bell * apart[i] * apart[j] / (2 * length**2)
-                    value[i, :, j] += shared
-                    slope[i, :, j] += shared * (scaled - 2)
+        scaled = square / self.length**2
+        bell = self.strength**2 * np.exp(-scaled / 2)
+        for i in range(3):
+            value[i, :, i] = bell * (1 - scaled / 2) if self.incompressible else bell
+            slope[i, :, i] = bell * scaled * (2 - scaled / 2) if self.incompressible else bell * scaled
+            for j in range(3) if self.incompressible else ():
+                shared = bell * apart[i] * apart[j] / (2 * self.length**2)
+                value[i, :, j] += shared
+                slope[i, :, j] += shared * (scaled - 2)
         return value.reshape(len(a), len(b)), slope.reshape(len(a), len(b))
 
-    def diag(self, X: np.ndarray) -> np.ndarray:  # noqa: N803
+    def diag(self, X: np.ndarray) -> np.ndarray:
         """Return the variance of each row."""
         variance: np.ndarray = self.strength**2 + MEAN**2 + self.noise(X) + JITTER
         return variance
@@ -166,7 +160,7 @@ class FlowProcess:
         every = max(-(-len(places) // MOST_FITTED), 1)
         some = np.concatenate([np.arange(k * len(places), (k + 1) * len(places), every) for k in range(3)])
         part = cls(covariance=FlowCovariance(), level=level, rows=rows[some], targets=targets[some])
-        forms = [FlowCovariance(incompressible=one, mixed=mixed) for one, mixed in FORMS]
+        forms = [FlowCovariance(incompressible=one) for one in (False, True)]
         for _ in range(ROUNDS):
             fits = [_fit(form, part.rows, part.targets) for form in forms]
             best = max(fits, key=lambda fit: float(fit.log_marginal_likelihood_value_))
@@ -189,10 +183,16 @@ class FlowProcess:
         return factor, cho_solve((factor, True), self.targets[some])
 
     def left_out(self) -> np.ndarray:
-        """Return residuals of links from the process of all others, over their standard errors, shape (link, 3)."""
-        some = np.arange(len(self.rows))
+        """Return residuals of links from the process of the other ones, over their standard errors, shape (link, 3).
+
+        Of many links an even choice is taken. See [2]_, equations 5.10 to 5.12.
+        """
+        count = len(self.rows) // 3
+        every = max(-(-count // MOST_SOLVED), 1)
+        some = np.concatenate([np.arange(k * count, (k + 1) * count, every) for k in range(3)])
         inverse = np.linalg.inv(self.covariance(self.rows[some]))
-        return ((inverse @ self.targets[some]) / np.sqrt(np.diag(inverse))).reshape(3, -1).T
+        found: np.ndarray = ((inverse @ self.targets[some]) / np.sqrt(np.diag(inverse))).reshape(3, -1).T
+        return found
 
     def means(self, centres: np.ndarray, edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return means over windows and their standard errors.
@@ -211,7 +211,9 @@ class FlowProcess:
         """
         points = _cube(np.asarray(edge, float))
         at = _rows(points, np.zeros_like(points))
-        own = self.covariance.smooth(at, at)[0].reshape(3, len(points), 3, len(points)).mean((1, 3)).diagonal() + MEAN**2
+        own = (
+            self.covariance.smooth(at, at)[0].reshape(3, len(points), 3, len(points)).mean((1, 3)).diagonal() + MEAN**2
+        )
         mean, error = (np.zeros((len(centres), 3)) for _ in range(2))
         for windows, links in self._parts(centres):
             rows = np.concatenate([links + k * (len(self.rows) // 3) for k in range(3)])
@@ -264,5 +266,7 @@ def _rows(places: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 def _cube(edge: np.ndarray) -> np.ndarray:
     """Return points evenly spread over a window about 0, shape (point, 3); one point of an edge of 0."""
-    steps = [((np.arange(n) + 0.5) / n - 0.5) * size for size, n in zip(edge, np.where(edge > 0, POINTS, 1), strict=True)]
+    steps = [
+        ((np.arange(n) + 0.5) / n - 0.5) * size for size, n in zip(edge, np.where(edge > 0, POINTS, 1), strict=True)
+    ]
     return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -180,7 +180,7 @@ def correlate(
     last = pair.without_standing_light(last)
     measurable = last.coverage.measurable
     share = float(last.valid[measurable].mean()) if measurable.any() else 0.0
-    verdict = Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
+    verdict = verdict_of(share)
     if verdict is not Verdict.GOOD:
         if moves_beyond(pair.first, pair.second, first_search):
             verdict = Verdict.TOO_FAR
@@ -202,6 +202,11 @@ def correlate(
     }
     deviation = with_systematic(last.deviation(), last.field, last.valid, unexplained(volume_a, volume_b))
     return xr.Dataset(_variables(last, deviation, axes, dt_s), _coordinates(last, axes), attributes)
+
+
+def verdict_of(share: float) -> Verdict:
+    """Return the verdict on vectors of which a share is valid, of those that can be."""
+    return Verdict.GOOD if share >= GOOD_SHARE else Verdict.POOR if share >= POOR_SHARE else Verdict.FAILED
 
 
 def _variables(result: Pass, deviation: np.ndarray, axes: VoxelAxes, dt_s: float | None) -> dict[str, Variable]:
