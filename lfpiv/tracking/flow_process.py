@@ -38,6 +38,8 @@ SCATTERS = (0.01, 1.0)
 """Bounds of the scatter of unresolved structures [voxel]."""
 START = (1.0, 12.0, 0.05)
 """Strength, length and scatter from which the evidence is maximised [voxel]."""
+FIRST_LENGTHS = (5.0, 40.0)
+"""Other lengths from which it is maximised [voxel]: of a shear, one start ended at no flow that varies."""
 MEAN = 3.0
 """Standard deviation of the flow's mean about the mean of the links [voxel]: so large that it tells nothing."""
 CAUCHY = 2.5
@@ -160,12 +162,12 @@ class FlowProcess:
         every = max(-(-len(places) // MOST_FITTED), 1)
         some = np.concatenate([np.arange(k * len(places), (k + 1) * len(places), every) for k in range(3)])
         part = cls(covariance=FlowCovariance(), level=level, rows=rows[some], targets=targets[some])
-        forms = [FlowCovariance(incompressible=one) for one in (False, True)]
-        for _ in range(ROUNDS):
+        forms = [FlowCovariance()]  # the most tolerant form tells which links are false
+        for number in range(ROUNDS):
             fits = [_fit(form, part.rows, part.targets) for form in forms]
             best = max(fits, key=lambda fit: float(fit.log_marginal_likelihood_value_))
             part = replace(part, covariance=best.kernel_).weighted()
-            forms = [best.kernel_]
+            forms = [best.kernel_, *([FlowCovariance(incompressible=True)] if number == 0 else [])]
         return cls(covariance=part.covariance, level=level, rows=rows, targets=targets).weighted()
 
     def weighted(self) -> FlowProcess:
@@ -247,9 +249,12 @@ class FlowProcess:
 
 
 def _fit(form: FlowCovariance, rows: np.ndarray, targets: np.ndarray) -> GaussianProcessRegressor:
+    """Maximise the evidence from several lengths and from the form's own; return the best fit."""
+    starts = [form, *(form.clone_with_theta(np.log([length, START[2], START[0]])) for length in FIRST_LENGTHS)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # of a parameter at its bound
-        return GaussianProcessRegressor(form, alpha=0.0).fit(rows, targets)
+        fits = [GaussianProcessRegressor(start, alpha=0.0).fit(rows, targets) for start in starts]
+    return max(fits, key=lambda fit: float(fit.log_marginal_likelihood_value_))
 
 
 def _rows(places: np.ndarray, error: np.ndarray) -> np.ndarray:

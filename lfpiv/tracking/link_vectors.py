@@ -17,7 +17,7 @@ from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.cross_correlation import verdict_of
 from lfpiv.velocity.settings import CorrelationSettings
 
-LEAST_LINKS = 20
+LEAST_LINKS = 40
 """Least number of valid links that tell the length and the strength of a flow."""
 LEAST_LINKED = 0.65
 """Least share of the found particles that are linked. Ghosts in two frames have no partners, and mislead links."""
