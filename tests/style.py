@@ -58,7 +58,7 @@ MAY_IMPORT = {
     "results": {"experiment", "velocity"},
     "weights": {"calibration", "lightfield"},
     "reconstruction": {"weights", "calibration", "lightfield", "velocity"},
-    "tracking": {"reconstruction", "weights", "calibration", "metrics"},
+    "tracking": {"reconstruction", "weights", "calibration", "metrics", "velocity"},
     "joint": {"reconstruction", "weights", "velocity"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},

@@ -55,7 +55,8 @@ def check(experiment: Experiment | str | Path, out: str | Path, *, progress: Pro
     """
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    views, stretches = [], []
+    views: list[BoardView] = []
+    stretches: list[float] = []
     with collected(quiet=True):  # a calibration says them again
         for number, setup in enumerate(experiment.cameras):
             view, found = _view(experiment, setup)

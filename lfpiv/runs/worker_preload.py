@@ -12,7 +12,7 @@ import tifffile
 import warp
 
 from lfpiv.calibration import cameras
-from lfpiv.reconstruction import motion
+from lfpiv.joint import pair
 from lfpiv.runs import dispatch, worker
 from lfpiv.velocity import cross_correlation
 from lfpiv.weights import storage
