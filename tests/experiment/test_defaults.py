@@ -27,8 +27,8 @@ def defaults(call):
         (lfpiv.reconstruct_pair, Smart(), {"estimate"}),
         (PairSolver, Smart(), {"estimate"}),
         (lfpiv.correlate, Correlation(), set(Correlation.model_fields)),
-        (lfpiv.find_particles, Tracking(), set(Tracking.model_fields)),
-        (ParticleSearch, Tracking(), set(Tracking.model_fields)),
+        (lfpiv.find_particles, Tracking(), set(Tracking().search)),
+        (ParticleSearch, Tracking(), set(Tracking().search)),
     ],
 )
 def test_calls_have_the_defaults_of_the_tables(call, table, keys):
