@@ -21,6 +21,7 @@ import xarray as xr
 from lfpiv.geometry.grid import AXES
 from lfpiv.joint.pair import MOVED, UNSHARED, Estimate
 from lfpiv.joint.spline_field import window_shares
+from lfpiv.velocity.changed_vectors import with_displacement
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.peak_width import peak_reach, refine_search
@@ -46,7 +47,7 @@ ATTRIBUTES = ("estimate", "rounds", "misfit_ratio", "lossy")
 
 
 def is_joint(*volumes: xr.DataArray) -> bool:
-    """Return whether volumes are those of a joint fit."""
+    """Return whether volumes come from a joint fit."""
     has_field = all(name in volumes[0].coords for name in MOVED.values())
     return has_field and all(UNSHARED in volume.coords for volume in volumes)
 
@@ -67,11 +68,11 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     -------
     Dataset
         As `correlate` returns it. ``joint`` is true where the vector is the mean of the fitted displacement over the
-        window, false where the frames by themselves contradict it and the vector is that of their correlation.
-        ``uncertainty_z``, ``_y``, ``_x`` of the former are those of the frames by themselves, lowered as the fit
-        lowers the error, and what is left between these frames.
-        ``valid`` is that of their correlation. ``correlation`` and ``peak_ratio`` are those of the frames by
-        themselves, deformed by the fitted displacement.
+        window, false where the frames by themselves contradict it and their correlation gives the vector.
+        ``uncertainty_z``, ``_y``, ``_x`` of fitted vectors combine the uncertainty of the frames by themselves, lowered
+        as the fit lowers the error, with the displacement that is left between these frames. ``valid`` is taken from
+        the correlation of these frames, ``correlation`` and ``peak_ratio`` from the same frames deformed by the fitted
+        displacement.
 
     Raises
     ------
@@ -160,23 +161,14 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, factor: float = 1.0) -> xr.
     own = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], -1)
     joint = evidence.agrees(valid) & np.isfinite(own).all(-1)
     displacement = np.where(joint[..., None], evidence.fitted, own)
-    changed: dict[str, np.ndarray] = {}
-    for k, axis in enumerate(AXES):
-        changed[f"displacement_{axis}"] = displacement[..., k]
-    if "dt_s" in vectors.attrs:
-        metres = np.asarray(vectors.attrs["voxel_mm"]) * 1e-3 / vectors.attrs["dt_s"]
-        for name, k in zip("uvw", (2, 1, 0), strict=True):
-            changed[name] = displacement[..., k] * metres[k]
     stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
     fitted = factor * np.sqrt((ALONE_SHARE * stated) ** 2 + (LEFT_SHARE * evidence.left) ** 2)
-    deviation = np.where(joint[..., None], fitted, stated)
-    for k, axis in enumerate(AXES):
-        changed[f"uncertainty_{axis}"] = deviation[..., k]
-    changed["uncertainty"] = np.sqrt((deviation**2).sum(-1))
-    changed["correlation"] = np.where(joint, evidence.correlation, vectors["correlation"].values)
-    changed["peak_ratio"] = np.where(joint, evidence.peak_ratio, vectors["peak_ratio"].values)
-    found = {name: vectors[name].copy(data=values.astype(np.float32)) for name, values in changed.items()}
+    merged = with_displacement(vectors, displacement, np.where(joint[..., None], fitted, stated))
+    found = {
+        name: vectors[name].copy(data=np.where(joint, deformed, vectors[name].values).astype(np.float32))
+        for name, deformed in (("correlation", evidence.correlation), ("peak_ratio", evidence.peak_ratio))
+    }
     about = {"long_name": "mean of the fitted displacement; false: contradicted, and measured by correlation"}
     found["joint"] = xr.DataArray(joint, vectors["valid"].coords, vectors["valid"].dims, attrs=about)
     share = float(joint[valid].mean()) if valid.any() else 0.0
-    return vectors.assign(found).assign_attrs(joint_fraction=share)
+    return merged.assign(found).assign_attrs(joint_fraction=share)

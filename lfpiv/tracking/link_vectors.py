@@ -1,4 +1,4 @@
-"""`vectors_from_links`: vectors of a pair from its linked particles, in place of those of the correlation.
+"""`vectors_from_links`: vectors of a pair from its linked particles, in place of the correlation's.
 
 One camera sees depth through the pupil alone, and its volumes are long in depth. Correlation finds depth displacements
 with errors of half a voxel there. The links of single particles, a process through them, and its means over the windows
@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
+from lfpiv.velocity.changed_vectors import with_displacement
 from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.cross_correlation import verdict_of
 from lfpiv.velocity.settings import CorrelationSettings
@@ -31,7 +32,7 @@ def vectors_from_links(vectors: xr.Dataset, links: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     vectors : Dataset
-        From `correlate`, with coordinates [mm] and velocities. Its windows are taken.
+        From `correlate`, with coordinates [mm]. Its windows are taken.
     links : Dataset
         From `link_particles`. Those that are not valid do not enter.
 
@@ -83,23 +84,13 @@ def vectors_from_links(vectors: xr.Dataset, links: xr.Dataset) -> xr.Dataset:
 
 def _merged(vectors: xr.Dataset, mean: np.ndarray, deviation: np.ndarray) -> xr.Dataset:
     """Return vectors with other displacements and standard deviations, shape (z, y, x, 3) along x, y, z [voxel]."""
-    measurable = ~vectors["masked"].values & (vectors["seeded_share"].values >= LEAST_SEEDED)
-    valid = measurable & (deviation <= LARGEST_VOXEL).all(-1)
-    known, stated = np.where(vectors["masked"].values, np.nan, 1.0), np.where(valid, 1.0, np.nan)
-    metres = np.atleast_1d(vectors.attrs["voxel_mm"])[0] * 1e-3 / vectors.attrs["dt_s"]
-    fields = {"uncertainty": np.sqrt(np.square(deviation).sum(-1)) * stated}
-    for k, (axis, name) in enumerate(zip("xyz", "uvw", strict=True)):
-        fields[f"displacement_{axis}"] = mean[..., k] * known
-        fields[name] = mean[..., k] * known * metres
-        fields[f"uncertainty_{axis}"] = deviation[..., k] * stated
-    changed = {name: vectors[name].copy(data=values.astype(np.float32)) for name, values in fields.items()}
-    for name in changed:
-        if name.startswith("uncertainty"):
-            changed[name].attrs["long_name"] = (
-                changed[name].attrs["long_name"].split(":")[0] + ": of the linked particles"
-            )
-    changed["valid"] = vectors["valid"].copy(data=valid)
-    share = float(valid[measurable].mean()) if measurable.any() else 0.0
     fluid = ~vectors["masked"].values
-    valid_fraction = float(valid[fluid].mean()) if fluid.any() else 0.0
-    return vectors.assign(changed).assign_attrs(valid_fraction=valid_fraction, verdict=verdict_of(share).value)
+    measurable = fluid & (vectors["seeded_share"].values >= LEAST_SEEDED)
+    valid = measurable & (deviation <= LARGEST_VOXEL).all(-1)
+    known, stated = np.where(fluid, 1.0, np.nan)[..., None], np.where(valid, 1.0, np.nan)[..., None]
+    found = with_displacement(vectors, (mean * known)[..., ::-1], (deviation * stated)[..., ::-1])
+    for name in ("uncertainty", *(f"uncertainty_{axis}" for axis in AXES)):
+        found[name].attrs["long_name"] = found[name].attrs["long_name"].split(":")[0] + ": of the linked particles"
+    shares = [float(valid[part].mean()) if part.any() else 0.0 for part in (fluid, measurable)]
+    verdict = verdict_of(shares[1]).value
+    return found.assign(valid=vectors["valid"].copy(data=valid)).assign_attrs(valid_fraction=shares[0], verdict=verdict)
