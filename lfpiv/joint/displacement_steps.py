@@ -1,9 +1,9 @@
 """Gauss-Newton steps of the displacement through the weights, with the light fixed.
 
-The misfit of both frames is that of SMART. Its gradient by the displacement d of a voxel is
+Both frames have the misfit of SMART. Its gradient by the displacement d of a voxel is
 ``-s/2 c grad(T^T G' e_f)``, with the exponent e_f of SMART. Its curvature takes the derivative of the moved light to
-the images, divides by P + b, and takes it back. The curvature changes slowly with the rays, so that of a part of the
-subsets stands for all. The prior is `ROUGH` times the misfit per lit pixel times the squared second differences of the
+the images, divides by P + b, and takes it back. The curvature of a part of the subsets stands for all, since it changes
+slowly with the rays. The prior is `ROUGH` times the misfit per lit pixel times the squared second differences of the
 nodes. Conjugate gradients, preconditioned by the light near each node, solve for the step.
 """
 
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lfpiv.joint.conjugate_gradients import conjugate_gradients
 from lfpiv.joint.model import JointModel
 from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.weights.operator import Weights
@@ -108,7 +109,7 @@ class DisplacementSteps:
     model : JointModel
         The model of the frames.
     part : Subset
-        Rays whose curvature stands for that of all.
+        Rays whose curvature stands for all rays.
     """
 
     def __init__(self, model: JointModel, part: Subset):
@@ -152,7 +153,7 @@ class DisplacementSteps:
     def curvature(
         self, light: np.ndarray, transports: tuple[Transport, Transport], residual: Residual
     ) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the map from a change of the nodes to that of the gradient."""
+        """Return the map from a change of the nodes to a change of the gradient."""
         model = self.model
         own = [model.light_of(number, light) for number in range(2)]
         shares = [
@@ -182,11 +183,12 @@ class DisplacementSteps:
         near = model.field.adjoint(np.broadcast_to(light, (3, *light.shape)))
         near = np.maximum(near / near.mean(), LEAST_SHARE)
         inverse = 1 / (scale * near + rough * SECOND_DIFFERENCES + floor)
-        change = _conjugate_gradients(
+        change = conjugate_gradients(
             lambda way: curvature(way) + rough * model.field.penalty(way) + floor * way,
             -(gradient + rough * model.field.penalty(nodes)),
-            inverse,
-            steps,
+            steps=steps,
+            least=SMALL_REST,
+            inverse=inverse,
         )
         change *= relaxation
         largest = float(np.abs(model.field.values(change)).max())
@@ -206,23 +208,3 @@ class DisplacementSteps:
             mean = (draw * curvature(draw)).sum((1, 2, 3)) / (draw**2).sum((1, 2, 3))
             self._scale = np.maximum(mean, LEAST_CURVATURE * mean.max())[:, None, None, None]
         return self._scale
-
-
-def _conjugate_gradients(
-    matrix: Callable[[np.ndarray], np.ndarray], rest: np.ndarray, inverse: np.ndarray, steps: int
-) -> np.ndarray:
-    """Return an approximate solution of matrix x = rest after some steps."""
-    found, scaled = np.zeros_like(rest), inverse * rest
-    way, square = scaled.copy(), float((rest * scaled).sum())
-    least = SMALL_REST * square
-    for _ in range(steps):
-        image = matrix(way)
-        length = square / float((way * image).sum())
-        found += length * way
-        rest = rest - length * image
-        scaled = inverse * rest
-        square, before = float((rest * scaled).sum()), square
-        if square < least:
-            break
-        way = scaled + (square / before) * way
-    return found

@@ -14,6 +14,7 @@ import xarray as xr
 from scipy.interpolate import BSpline
 
 from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.joint.conjugate_gradients import conjugate_gradients
 from lfpiv.velocity.settings import CorrelationSettings
 
 SPACING_VOXEL = 8.0
@@ -111,19 +112,7 @@ class SplineField:
             total: np.ndarray = fitted + ROUGH_START * self.penalty(nodes) + SMALL * nodes
             return total
 
-        rest = _along_axes(back, weight * given)
-        nodes, way, square = np.zeros_like(rest), rest.copy(), float((rest**2).sum())
-        least = SMALL**2 * square
-        for _ in range(STEPS_OF_FIT):
-            if square <= least:
-                break
-            image = normal(way)
-            length = square / float((way * image).sum())
-            nodes += length * way
-            rest -= length * image
-            square, before = float((rest**2).sum()), square
-            way = rest + (square / before) * way
-        return nodes
+        return conjugate_gradients(normal, _along_axes(back, weight * given), steps=STEPS_OF_FIT, least=SMALL**2)
 
 
 def window_shares(voxels_mm: np.ndarray, centres_mm: np.ndarray, edge_mm: float) -> np.ndarray:
