@@ -104,7 +104,10 @@ class Rig(Shown):
         volumes = self._volumes(pair, part_of(step, 0.0, RECONSTRUCTED))
         step(RECONSTRUCTED)
         with threadpool_limits(1):  # as in a run, whose numbers do not depend on the threads of BLAS
-            vectors, _ = self.work.measured(self.work.files(pair), volumes)
+            if self.experiment.by_links:
+                vectors, _, _ = self.work.tracked(self.work.files(pair), volumes)
+            else:
+                vectors = self.work.vectors_between(pair, volumes)
         step(CORRELATED)
         origin = self.work.files(pair).origin
         return vectors.assign_attrs({"experiment": self.experiment.name, **origin})

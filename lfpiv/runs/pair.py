@@ -40,7 +40,7 @@ from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.link_vectors import vectors_from_links
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.warn import FirstOfEachCode, Warning
+from lfpiv.warn import Code, FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -344,10 +344,10 @@ class PairWork:
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         return vectors
 
-    def measured(self, files: PairFiles, volumes: PairVolumes) -> tuple[xr.Dataset, xr.Dataset | None]:
-        """Return the vectors of a pair, and its linked particles if they are wanted.
+    def tracked(self, files: PairFiles, volumes: PairVolumes) -> tuple[xr.Dataset, xr.Dataset, list[Warning]]:
+        """Return the vectors of a pair, its linked particles, and the warnings about these.
 
-        Vectors are those of the links where these resolve the flow better.
+        Where links resolve the flow better, vectors are means of the flow through them.
 
         Raises
         ------
@@ -355,8 +355,6 @@ class PairWork:
             If an image cannot be read again.
         """
         vectors = self.vectors_between(files.pair, volumes)
-        if files.particles is None or self.weights is None:
-            return vectors, None
         start = time.perf_counter()
         light = [self.light_again(file.frame) for file in files.frames]
         table, found = track(self.search, self.fits, light, volumes, vectors)
@@ -365,16 +363,19 @@ class PairWork:
         elif self.experiment.by_links:
             vectors = vectors_from_links(vectors, table)
             vectors.attrs["correlation_s"] += time.perf_counter() - start
+            if "links" not in vectors.attrs and len(self.experiment.cameras) == 1:
+                found.append(Warning(code=Code.ONE_CAMERA))
         vectors.attrs["warnings"] = warn.to_text((*volumes.warnings, *found))
-        return vectors, table
+        return vectors, table, found
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment, condensed = self.experiment, volumes.condensed()
-        vectors, table = self.measured(files, volumes)
-        found = warn.from_text(vectors.attrs["warnings"])
-        if table is not None:
-            self._keep_particles(files, table, found[len(volumes.warnings) :])
-        figures = pair_figures.measure(vectors, condensed, found)
+        if files.particles is None or self.weights is None:
+            vectors, found = self.vectors_between(files.pair, volumes), list[Warning]()
+        else:
+            vectors, table, found = self.tracked(files, volumes)
+            self._keep_particles(files, table, found)
+        figures = pair_figures.measure(vectors, condensed, (*volumes.warnings, *found))
         self._log(files.pair, volumes.between)
         if figures.verdict not in (*REFUSED, Verdict.GOOD.value):
             self._log(files.pair, [figures.few_valid_warning(files.pair)])

@@ -51,7 +51,7 @@ class JointFigures:
     lossy: bool = False
     """Whether brightness differs between the frames, since particles are lost between them."""
     share: float = 0.0
-    """Share of the valid vectors that are means of the fitted displacement; the others are those of the correlation."""
+    """Share of the valid vectors that are means of the fitted displacement; the correlation gives the others."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -190,6 +190,11 @@ def correlate(
                 f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
+        if known and current.experiment.by_links:
+            raise InputError(
+                f"{current.experiment.path}: tracking.vectors takes the vectors from linked particles, which are found "
+                'in the images, not in volumes. Use `lfpiv run`, or set tracking.vectors = "correlation".'
+            )
         if known:
             rig.tell_vectors(current.experiment)
         calibration = rig.with_standing_light(current, calibrated.calibration)

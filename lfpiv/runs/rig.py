@@ -235,7 +235,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
     calibration, self_calibration = prepared.calibration, prepared.self_calibration
     require_seen(experiment.path, calibration, experiment.grid)
     warn_outside(calibration, experiment.grid)
-    if len(calibration.cameras) == 1:
+    if len(calibration.cameras) == 1 and not experiment.by_links:
         log.warning("%s", Warning(code=Code.ONE_CAMERA).sentence)
     for warning in guard.warnings(experiment, run.guard) + refinement.warnings(experiment, run.refinement):
         log.warning("%s", warning.sentence)

@@ -311,7 +311,7 @@ def _warnings(
 ) -> dict[str, Warning]:
     """Collect all warnings by their sentences, each once."""
     found = [
-        *rig_warnings(calibrated.calibration, experiment.grid),
+        *rig_warnings(calibrated.calibration, experiment),
         *vector_grid.warnings(experiment.correlation, experiment.grid.shape),
         *guard.warnings(experiment, contents.guard),
         *refinement.warnings(experiment, contents.refinement),
@@ -355,12 +355,13 @@ def copied_warnings(copies: Mapping[int, int], noun: str) -> list[Warning]:
     )
 
 
-def rig_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
+def rig_warnings(calibration: Calibration, experiment: Experiment) -> list[Warning]:
     """Return the warnings about the calibration, and about the position of the cameras relative to the volume."""
     found = [warning for camera in calibration.cameras.values() for warning in camera.warnings]
     found += () if calibration.board is None else calibration.board.warnings
-    found += [*outside_warnings(calibration, grid), *sight_warnings(calibration, grid)]
-    return [*found, Warning(code=Code.ONE_CAMERA)] if len(calibration.cameras) == 1 else found
+    found += [*outside_warnings(calibration, experiment.grid), *sight_warnings(calibration, experiment.grid)]
+    alone = len(calibration.cameras) == 1 and not experiment.by_links  # pairs with too few links say it
+    return [*found, Warning(code=Code.ONE_CAMERA)] if alone else found
 
 
 def image_warnings(pairs: Mapping[int, Iterable[Warning]]) -> list[Warning]:

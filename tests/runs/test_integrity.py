@@ -8,7 +8,7 @@ from support.small_run import PAIRS, same_vectors
 from support.stored import rewrite
 
 import lfpiv
-from lfpiv.errors import DamagedFile
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.results.provenance import read_marks
 from lfpiv.runs import pipeline
 
@@ -125,3 +125,11 @@ def test_a_run_mends_a_folder_with_equal_numbers(small_run, out, caplog):
     caplog.clear()
     pipeline.run(small_run.experiment, out, keep_volumes=True)
     assert not rejected(caplog)
+
+
+def test_vectors_of_links_are_not_made_from_volumes(small_run, tmp_path):
+    """Volumes hold no linked particles."""
+    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    experiment.write_text(experiment.read_text("utf-8") + '\n[tracking]\nvectors = "links"\n', "utf-8")
+    with pytest.raises(InputError, match=r"tracking.vectors .* Use `lfpiv run`"):
+        pipeline.correlate(experiment, out)
