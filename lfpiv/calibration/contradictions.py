@@ -74,7 +74,7 @@ def warn_unstated(experiment: Experiment) -> None:
 def cause(experiment: Experiment, decoder_of: Decoders, stretches: Sequence[float] = ()) -> str | None:
     """Name the mistake that explains all board images better than the stated rig, as a message; None without one.
 
-    A board with a mark names its dots by itself and is left out. `stretches` are those of `likely_stretches`.
+    A board with a mark names its dots by itself and is left out. `stretches` come from `likely_stretches`.
     """
     if experiment.board.mark:
         return None

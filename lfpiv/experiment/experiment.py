@@ -304,7 +304,7 @@ class Experiment(Shown):
 
     @property
     def by_links(self) -> bool:
-        """Whether vectors are those of linked particles. Ghosts do not damp them."""
+        """Whether linked particles give the vectors. Ghosts do not damp these."""
         return self.tracking is not None and self.tracking.gives_vectors(len(self.cameras))
 
     def frame_images(self, frame: Frame) -> list[ImagePath]:

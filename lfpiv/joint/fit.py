@@ -52,7 +52,7 @@ LOST, JUDGED = 3.2, 2
 UNEQUAL = 0.13
 """Rms of rho, weighted by the light, above which they are: the fit begins again with brightness that may differ."""
 PART = 2
-"""The curvature is that of one subset of the rays in so many."""
+"""The curvature is taken from one subset of the rays in so many."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _loss(model: JointModel, found: Sequence[Reconstruction], nodes: np.ndarray)
 
 
 def _curvature_rays(steps: LightSteps, cameras: int) -> Subset:
-    """Return the rays whose curvature stands for that of all: some subsets of all cameras, or every ray."""
+    """Return the rays whose curvature stands for all rays: some subsets of all cameras, or every ray."""
     subsets = steps.partitions[0].subsets
     if len(subsets) >= PART and len(subsets[0].parts) >= cameras:
         return Subset(tuple(part for subset in subsets[: len(subsets) // PART] for part in subset.parts))

@@ -111,7 +111,7 @@ class LightSteps:
 
 
 def _partition(normalisation: LensSubsets | RowSubsets, cameras: int) -> Partition:
-    """Return the subsets to iterate over: those of the reconstruction, or all rays at once."""
+    """Return the subsets to iterate over: as in the reconstruction, or all rays at once."""
     if normalisation.has_subsets:
         found: Partition = normalisation.partitions[0]
         return found

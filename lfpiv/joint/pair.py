@@ -36,7 +36,7 @@ from lfpiv_kernels.transfer import to_host
 log = logging.getLogger(__name__)
 
 ALONE_SHARE = 0.3
-"""Share of the time of both frames by themselves in that of a joint estimate."""
+"""Share of the time of a joint estimate that both frames take by themselves."""
 
 UNSHARED = "unshared"
 """Coordinate of a volume of a joint fit: the volume of the frame by itself."""
@@ -226,7 +226,7 @@ def reconstruct_pair(
         Settings of `correlate`, which gives the first displacement of a joint fit; default: those of an experiment
         without such a table.
     mask : ndarray or DataArray, shape (z, y, x), or a tuple or list of two, optional
-        Voxels without fluid, as of `reconstruct`; of a body that moves those of each frame.
+        Voxels without fluid, as of `reconstruct`; of a body that moves, one mask for each frame.
     progress : callable, optional
         Called with the finished fraction.
     **smart

@@ -119,7 +119,7 @@ def overlapping_by_chance(series: Series) -> int | None:
     """Return of how many images particles overlap somewhere by chance; None if the shifted images show chance.
 
     Of few thin images, a chance of some percent shows in no shifted image but may in the images themselves. Their
-    minimum then has to surpass that of fewer shifted images, which overlap somewhere.
+    minimum then has to surpass the minimum of fewer shifted images, which overlap somewhere.
     """
     lenses = series.largest.size / series.decoder.optics.microimage_pitch_px**2
     lit = LIT_PART * series.lit

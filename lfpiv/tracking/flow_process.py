@@ -1,7 +1,7 @@
 """`FlowProcess`: the flow as a Gaussian process whose covariance the displacements of linked particles decide.
 
-A link measures y = u(x) + e. Its error e has the stated variance and that of structures smaller than the process
-resolves. Components of the flow u have the mean 0 after the links' mean is subtracted, and the covariance [1]_
+A link measures y = u(x) + e. The error e has the stated variance, and the variance of structures smaller than the
+process resolves. Once the links' median is subtracted, components of the flow u have the mean 0 and the covariance [1]_
 
     independent:     s^2 exp(-r^2 / 2 l^2) I
     incompressible:  s^2 [(1 - r^2 / 2 l^2) I + r r' / 2 l^2] exp(-r^2 / 2 l^2)
@@ -41,7 +41,7 @@ START = (1.0, 12.0, 0.05)
 FIRST_LENGTHS = (5.0, 40.0)
 """Other lengths from which it is maximised [voxel]: of a shear, one start ended at no flow that varies."""
 MEAN = 3.0
-"""Standard deviation of the flow's mean about the mean of the links [voxel]: so large that it tells nothing."""
+"""Standard deviation of the flow's mean about the median of the links [voxel]: so large that it tells nothing."""
 CAUCHY = 2.5
 """Residual at which a link counts half [standard deviation]."""
 ROUNDS = 3
@@ -57,6 +57,7 @@ REACH = 2.5
 POINTS = 4
 """Points along each edge of a window whose mean is taken."""
 JITTER = 1e-10
+"""Variance added to each link, so that the covariance stays positive in rounding [voxel^2]."""
 
 
 class FlowCovariance(Kernel):  # type: ignore[misc]
@@ -142,7 +143,7 @@ class FlowProcess:
 
     covariance: FlowCovariance
     level: np.ndarray
-    """Mean displacement of the links, shape (3,) [voxel]."""
+    """Median displacement of the links, shape (3,) [voxel]."""
     rows: np.ndarray
     """Rows of all links, components outermost, shape (3 link, 6)."""
     targets: np.ndarray
@@ -156,6 +157,11 @@ class FlowProcess:
         ----------
         places, moved, error : ndarray, shape (link, 3)
             Places of links, their displacements and standard errors [voxel].
+
+        Returns
+        -------
+        FlowProcess
+            Of all links. The evidence is maximised for an even choice of at most `MOST_FITTED`.
         """
         level = np.median(moved, axis=0)
         rows, targets = _rows(places, error), (moved - level).T.ravel()

@@ -85,7 +85,7 @@ class MemoryLeft:
         self._device = None if free is None else free - beside_bytes(cameras, grid)
 
     def holds(self, host: int, device: int) -> bool:
-        """Return whether weights of some sizes fit [byte]; those of the CPU need no memory of a device."""
+        """Return whether weights of some sizes fit [byte]; weights of the CPU need no memory of a device."""
         return host <= self._host and (self._device is None or device <= self._device)
 
     def require(self, name: str, choice: Choice, host: int) -> None:
@@ -108,7 +108,7 @@ class MemoryLeft:
             return
         left = max(int(min(self._device, most)), 0)
         raise InputError(
-            f"weights: those of camera {name!r} take {size_text(size)} of the GPU's memory, of which {size_text(left)} "
+            f"weights of camera {name!r} take {size_text(size)} of the GPU's memory, of which {size_text(left)} "
             "are left. Raise volume.voxel_mm, shrink volume.size_mm, use fewer workers per GPU, or --device cpu."
         )
 

@@ -1,8 +1,8 @@
-"""Measure the vectors of linked particles beside those of the correlation, with one camera.
+"""Measure the vectors of linked particles beside the correlation's, with one camera.
 
     python perf/accuracy/link_vectors.py --flows ring,swirl,turbulent --ppm 0.05,0.1 --seeds 1,2
 
-Cases are those of `reconstruction_cases`. Errors are root mean squares along x, y, z over all vectors [voxel].
+`reconstruction_cases` has the cases. Errors are root mean squares along x, y, z over all vectors [voxel].
 """
 
 from __future__ import annotations

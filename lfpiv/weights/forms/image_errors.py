@@ -1,4 +1,4 @@
-"""Images of particles and of single voxels by their own footprints, with which those of a form are compared."""
+"""Images of particles and of single voxels by their own footprints, to judge the images of a form."""
 
 from __future__ import annotations
 
