@@ -17,9 +17,8 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.files import size_text
-from lfpiv.planning.cost import NOTHING, Cost
 from lfpiv.planning.first_pair import FirstPair, board_cost, measure
-from lfpiv.planning.result import Disk, Memory, Plan, Time
+from lfpiv.planning.result import Cost, Disk, Memory, Plan, Time
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.refinement import LARGEST
 from lfpiv.runs import device_memory, memory, rig, worker_plan
@@ -51,7 +50,7 @@ def plan(
     """Say what a campaign will take, before it begins.
 
     The first pair is done as in a run, with simulated particles where its images are not there yet, and its times are
-    scaled. So it takes as long as the weights and one pair. Nothing is written.
+    scaled. So it takes as long as the weights and two pairs. Nothing is written.
 
     Parameters
     ----------
@@ -83,7 +82,10 @@ def plan(
         experiment = read_experiment(experiment)
     pairs = _whole("--pairs", experiment.pairs if pairs is None else pairs)
     workers = None if workers is None else _whole("--workers", workers, worker_plan.MAX_WORKERS)
-    shared = experiment if workers is None else _sharing(experiment, min(workers, pairs))
+    shared = experiment
+    if workers is not None:  # they share the threads
+        threads = max((experiment.compute.threads or cores()) // min(workers, pairs), 1)
+        shared = replace(experiment, compute=experiment.compute.model_copy(update={"threads": threads}))
     if out is not None and not Path(out).is_dir():
         raise InputError(f"--out: expected the folder of a run, found no folder {out}. Leave it out before a run.")
     with tempfile.TemporaryDirectory(prefix="lfpiv-") as scratch:
@@ -101,12 +103,6 @@ def _whole(name: str, value: object, most: int = 10**9) -> int:
     return value
 
 
-def _sharing(experiment: Experiment, workers: int) -> Experiment:
-    """Return the experiment with the CPU threads of one of several workers."""
-    threads = max((experiment.compute.threads or cores()) // workers, 1)
-    return replace(experiment, compute=experiment.compute.model_copy(update={"threads": threads}))
-
-
 def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Plan:
     """Measure the first pair and scale it. `run` has the threads of one worker."""
     step = run.step(FIRST_PAIR)
@@ -120,7 +116,11 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     worker_plan.require_memory(finest, estimated, 1)
     memory_of(run, estimated, workers)
     step(0.1)
-    prepared = {} if calibrated else board_cost(experiment, calibration, assumptions)
+    prepared = dict[str, Cost]()
+    if not calibrated and (cost := board_cost(experiment, calibration)) is not None:
+        prepared["calibration"] = cost
+    elif not calibrated:
+        assumptions.append("the time of the calibration is not in the plan: two planes of the board do not show it")
     first = measure(run, calibration, scratch, calibrated=calibrated)
     step(0.9)
     if not first.recorded:
@@ -133,8 +133,8 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
         pair=first.file_bytes,
         results=first.file_bytes * pairs,
         volumes=2 * memory.BYTES_PER_VALUE * experiment.grid.size,
-        weights=first.weights_bytes + _maps(calibration) if workers > 1 else 0,
-        free=shutil.disk_usage(_nearest(run.folder.path if stored else Path.cwd())).free,
+        weights=need.weights if workers > 1 else 0,
+        free=shutil.disk_usage(run.folder.path if stored else Path.cwd()).free,
     )
     step(1.0)
     return Plan(
@@ -159,10 +159,10 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
 
 def _scaled(experiment: Experiment, first: FirstPair, prepared: Mapping[str, Cost], pairs: int, workers: int) -> Time:
     """Return the time of the campaign."""
-    pair = sum(first.steps.values(), NOTHING)
+    pair = sum(first.steps.values(), Cost())
     simulated = experiment.bootstrap.count(pairs)
     again = pair * (simulated + 1 if simulated else 0)
-    total = sum(prepared.values(), NOTHING) + first.once + pair * math.ceil(pairs / workers) + again
+    total = sum(prepared.values(), Cost()) + first.once + pair * math.ceil(pairs / workers) + again
     return Time(
         preparation=prepared, first=first.once, pair=pair, steps=first.steps, simulated=again, total_s=total.wall_s
     )
@@ -236,14 +236,3 @@ def limits_of(finest: Experiment, need: Memory, disk: Disk, steps: Mapping[str, 
     name = max(steps, key=lambda one: steps[one].wall_s)
     share = steps[name].wall_s / sum(one.wall_s for one in steps.values())
     yield f"time: {100 * share:.0f} % of it is {name}"
-
-
-def _maps(calibration: Calibration) -> int:
-    """Return the size of the arrays by which stored weights say which ray is which pixel [byte]."""
-    layouts = (camera.microimages for camera in calibration.cameras.values())
-    return sum(one.pixel.nbytes + one.share.nbytes + one.corner.nbytes for one in layouts)
-
-
-def _nearest(path: Path) -> Path:
-    """Return a folder that exists: the path or the first one above it."""
-    return next(one for one in (path, *path.absolute().parents) if one.exists())

@@ -4,15 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from lfpiv.files import size_text
-from lfpiv.planning.cost import Cost
 from lfpiv.prompt import Card, Shown, count, times
 from lfpiv.quantities import duration
 from lfpiv_kernels.runtime import Device
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time of some work."""
+
+    wall_s: float = 0.0
+    """Time that passes [s]."""
+    cpu_s: float = 0.0
+    """Time of all threads on their cores [s]. Other programs on the machine change it little."""
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+    def __sub__(self, other: Cost) -> Cost:
+        """Subtract, to no less than nothing: small times scatter."""
+        return Cost(max(self.wall_s - other.wall_s, 0.0), max(self.cpu_s - other.cpu_s, 0.0))
+
+    def __mul__(self, factor: float) -> Cost:
+        return Cost(self.wall_s * factor, self.cpu_s * factor)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,33 +123,21 @@ class Plan(Shown):
     def to_json(self) -> dict[str, Any]:
         """Return the form of ``lfpiv plan --json``."""
 
-        def cost(one: Cost) -> dict[str, float]:
-            return {"wall_s": one.wall_s, "cpu_s": one.cpu_s}
+        def voxels(shape: tuple[int, int, int], edge_mm: float) -> dict[str, Any]:
+            return {"shape": list(shape), "voxels": math.prod(shape), "voxel_mm": edge_mm}
 
-        when = self.time
         return {
             "experiment": {"name": self.name, "file": str(self.file)},
             f"{self.noun}s": self.pairs,
             "workers": self.workers,
             "threads": self.device.threads,
             "device": self.device.figures(),
-            "volume": {"shape": list(self.shape), "voxels": math.prod(self.shape), "voxel_mm": self.voxel_mm},
-            "reconstructed": {
-                "shape": list(self.reconstructed),
-                "voxels": math.prod(self.reconstructed),
-                "voxel_mm": self.reconstructed_mm,
-            },
+            "volume": voxels(self.shape, self.voxel_mm),
+            "reconstructed": voxels(self.reconstructed, self.reconstructed_mm),
             "vectors": {"shape": list(self.vectors), "count": math.prod(self.vectors)},
-            "time": {
-                "preparation": {name: cost(one) for name, one in when.preparation.items()},
-                "first": cost(when.first),
-                "pair": cost(when.pair),
-                "steps": {name: cost(one) for name, one in when.steps.items()},
-                "simulated": cost(when.simulated),
-                "total_s": when.total_s,
-            },
-            "memory_bytes": vars(self.memory),
-            "disk_bytes": vars(self.disk),
+            "time": asdict(self.time),
+            "memory_bytes": asdict(self.memory),
+            "disk_bytes": asdict(self.disk),
             "fits": self.fits,
             "limits": list(self.limits),
             "assumptions": list(self.assumptions),
@@ -139,21 +146,16 @@ class Plan(Shown):
     def card(self) -> Card:
         """Return the plan for people."""
         when, need, disk = self.time, self.memory, self.disk
-        z, y, x = self.vectors
-        prepared = ", ".join(f"{name} {duration(one.wall_s)}" for name, one in when.preparation.items())
-        steps = ", ".join(f"{name} {duration(one.wall_s)}" for name, one in when.steps.items())
         all_of = f"{count(self.pairs, self.noun)} with {count(self.workers, 'worker')}"
         several = f", {size_text(need.worker)} for each worker" if self.workers > 1 else ""
+        finest = f"{times(self.reconstructed)} of {self.reconstructed_mm:.4g} mm: {math.prod(self.reconstructed):,}"
         facts = [
             ("device", self.device.sentence),
             ("volume", f"{times(self.shape)} voxels (z, y, x) of {self.voxel_mm:.4g} mm"),
-            (
-                "reconstructed",
-                f"{times(self.reconstructed)} of {self.reconstructed_mm:.4g} mm: {math.prod(self.reconstructed):,}",
-            ),
-            ("vectors", f"{times((x, y, z))} (x, y, z), {math.prod(self.vectors):,} per {self.noun}"),
-            ("preparation", f"{duration(sum(one.wall_s for one in when.preparation.values()))}: {prepared}"),
-            (f"a {self.noun}", f"{duration(when.pair.wall_s)}: {steps}"),
+            ("reconstructed", finest),
+            ("vectors", f"{times(self.vectors[::-1])} (x, y, z), {math.prod(self.vectors):,} per {self.noun}"),
+            ("preparation", _parts(when.preparation)),
+            (f"a {self.noun}", _parts(when.steps)),
             ("in all", f"{duration(when.total_s)} for {all_of}, without the report"),
             ("memory", f"{size_text(need.needed)}, {size_text(need.weights)} of it for weights{several}"),
             ("disk", f"{size_text(disk.results)}, {size_text(disk.pair)} per {self.noun}"),
@@ -165,3 +167,9 @@ class Plan(Shown):
             facts.append(("while it runs", f"{size_text(disk.weights)} of disk for the weights that workers share"))
         facts += [("limit", text) for text in self.limits] + [("taken for granted", text) for text in self.assumptions]
         return Card(f"Plan of {self.name!r}: {all_of}", tuple(facts))
+
+
+def _parts(costs: Mapping[str, Cost]) -> str:
+    """Return the time of all parts, and of each."""
+    each = ", ".join(f"{name} {duration(one.wall_s)}" for name, one in costs.items())
+    return f"{duration(sum(one.wall_s for one in costs.values()))}: {each}"

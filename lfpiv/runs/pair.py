@@ -31,6 +31,7 @@ from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, Volume
 from lfpiv.runs import belonging, pair_figures
 from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
 from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import REFUSED, measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
@@ -368,29 +369,37 @@ class PairWork:
         vectors.attrs["warnings"] = warn.to_text((*volumes.warnings, *found))
         return vectors, table, found
 
+    def result(
+        self, files: PairFiles, vectors: xr.Dataset, volumes: PairVolumes, found: Iterable[Warning] = ()
+    ) -> tuple[PairFigures, Callable[[], None]]:
+        """Return the figures of a pair's vectors, and what writes them to its file."""
+        condensed = volumes.condensed()
+        figures = pair_figures.measure(vectors, condensed, (*volumes.warnings, *found))
+        attributes = {
+            "experiment": self.experiment.name,
+            "smart": self.experiment.smart.model_dump(),
+            "correlation": self.experiment.correlation.model_dump(),
+            "figures": figures.to_json(),
+        }
+        return figures, partial(files.write_vectors, vectors, condensed, attributes)
+
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
-        experiment, condensed = self.experiment, volumes.condensed()
+        experiment = self.experiment
         if files.particles is None or self.weights is None:
             vectors, found = self.vectors_between(files.pair, volumes), list[Warning]()
         else:
             vectors, table, found = self.tracked(files, volumes)
             self._keep_particles(files, table, found)
-        figures = pair_figures.measure(vectors, condensed, (*volumes.warnings, *found))
+        figures, write_vectors = self.result(files, vectors, volumes, found)
         self._log(files.pair, volumes.between)
         if figures.verdict not in (*REFUSED, Verdict.GOOD.value):
             self._log(files.pair, [figures.few_valid_warning(files.pair)])
         if figures.lost_unseeded > 0:
             self._log(files.pair, [figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
-        attributes = {
-            "experiment": experiment.name,
-            "smart": experiment.smart.model_dump(),
-            "correlation": experiment.correlation.model_dump(),
-            "figures": figures.to_json(),
-        }
 
         def write() -> None:
-            files.write_vectors(vectors, condensed, attributes)
+            write_vectors()
             name = experiment.name_of(files.pair)
             valid, moved = 100 * figures.valid_fraction, figures.moved(experiment.grid.voxel_mm, experiment.dt_s)
             log.info("%s: %.0f %% of the vectors valid; median movement %s", name, valid, moved)

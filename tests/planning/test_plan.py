@@ -55,7 +55,7 @@ def test_the_memory_is_what_a_run_announces(planned, small_run):
     maps = sum(map(rays_bytes, lfpiv.load_calibration(small_run.out / "calibration.h5").cameras.values()))
     built = small_run.summary["weights"]["memory_mib"] * 2**20
     assert planned.memory.weights - maps == pytest.approx(built)
-    assert built < planned.disk.weights < planned.memory.weights
+    assert built < planned.disk.weights == planned.memory.weights
     memory_of = planned.memory
     assert memory_of.device_needed is memory_of.device_free is None
 
