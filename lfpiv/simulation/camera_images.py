@@ -59,6 +59,7 @@ def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.R
         first_lens=(int(first[0]), int(first[1])),
         plates=camera.plates,
         aberrations=camera.seidel,
+        lens=camera.lens_rays,
         faults=camera.faults,
     )
 
@@ -69,7 +70,7 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     Points have shape (n, 3) [mm], the result has shape (n,).
     """
     optics, points_mm = camera.optics, np.asarray(points_mm, float)
-    if not camera.window and camera.aberrations is None:
+    if not camera.window and camera.aberrations is None and camera.lens is None:
         distance = optics.object_distance_mm - camera.local_mm(points_mm)[:, 2]
         scale: np.ndarray = abs(camera.rotation[2, 2]) * (optics.image_distance_mm / distance) ** 2
         return scale

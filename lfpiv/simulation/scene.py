@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_serializer, model_validator
 from pydantic_core.core_schema import SerializerFunctionWrapHandler
 
+from lfpiv.errors import InputError
 from lfpiv.experiment.toml import read_toml
 from lfpiv.settings import bounds
 from lfpiv.settings.bounds import (
@@ -31,6 +32,7 @@ from lfpiv.settings.volume import Volume
 from lfpiv.simulation.board_errors import BoardErrors
 from lfpiv.simulation.flows import Flow, Tracers
 from lfpiv.simulation.image_files import check_pattern
+from lfpiv.simulation.lens import Lens
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
 from lfpiv.simulation.scene_camera import (
     SHARED_TABLES,
@@ -193,6 +195,8 @@ class Scene(Table):
     """Windows of all cameras that state none."""
     aberrations: Aberrations | None = None
     """Aberrations of all cameras that state none."""
+    lens: Lens | None = None
+    """Main lens of all cameras that state none."""
     array: ArrayFaults | None = None
     """Faults of the microlens arrays of all cameras that state none."""
     sensor: Sensor | None = None
@@ -232,12 +236,12 @@ class Scene(Table):
             raise ValueError("a different name for each camera")
         return cameras
 
-    @field_validator("window", "aberrations")
+    @field_validator("window", "aberrations", "lens")
     @classmethod
     def _suit_every_camera(cls, value: Any, info: ValidationInfo) -> Any:
         try:
             for camera in info.data.get("camera", ()):
-                camera.with_shared({"window": (), "aberrations": None} | {str(info.field_name): value})
+                camera.with_shared({"window": (), "aberrations": None, "lens": None} | {str(info.field_name): value})
         except ValidationError as error:
             raise error.errors()[0]["ctx"]["error"] from None
         return value
@@ -316,4 +320,17 @@ def open_scene(path: str | Path) -> Scene:
         else:
             flow.positions()
         scene = scene.model_copy(update={"flow": flow})
+    if any(camera.lens is not None and camera.lens.file is not None for camera in scene.camera):
+        scene = scene.model_copy(update={"camera": tuple(_with_lens(path, camera) for camera in scene.camera)})
     return scene
+
+
+def _with_lens(path: Path, camera: SceneCamera) -> SceneCamera:
+    """Return a camera with the surfaces that its lens's file states."""
+    if camera.lens is None:
+        return camera
+    lens = camera.lens.read(path.parent)
+    try:
+        return SceneCamera.model_validate(dict(camera) | {"lens": lens})
+    except ValidationError as error:
+        raise InputError(f"{path}: camera {camera.name!r}: lens.file: {error.errors()[0]['msg']}.") from None

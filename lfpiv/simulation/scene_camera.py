@@ -14,6 +14,7 @@ from lfpiv.settings import bounds
 from lfpiv.settings.bounds import Angle, Coordinate, Direction, Flag, Length, Point, Thickness
 from lfpiv.settings.rig import Flip, NominalCamera
 from lfpiv.settings.table import Table
+from lfpiv.simulation.lens import Lens
 from lfpiv.simulation.sensor import Sensor
 from lfpiv_kernels.rendering import real_optics
 
@@ -27,7 +28,7 @@ Pitches = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Index = Annotated[float, Field(strict=True, ge=1, le=4)]
 Drift = Annotated[float, Field(strict=True, ge=-0.05, le=0.05)]
 
-SHARED_TABLES = ("window", "aberrations", "array", "sensor")
+SHARED_TABLES = ("window", "aberrations", "lens", "array", "sensor")
 """Tables of a camera that a scene may state once for all cameras."""
 
 FOCUS_STEPS = 200
@@ -157,6 +158,8 @@ class SceneCamera(NominalCamera):
     """Windows of this camera, from the particles outwards; absent: the scene's."""
     aberrations: Aberrations | None = None
     """Aberrations of this camera's main lens; absent: the scene's."""
+    lens: Lens | None = None
+    """Surfaces of this camera's main lens; absent: the scene's, or a thin lens."""
     array: ArrayFaults | None = None
     """Faults of this camera's microlens array; absent: the scene's."""
     sensor: Sensor | None = None
@@ -179,6 +182,13 @@ class SceneCamera(NominalCamera):
                     f"a window whose normal is turned towards the camera (camera {self.name!r} meets it at "
                     f"{np.degrees(np.arccos(cosine)):.0f} degrees)"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _lens_passes_rays(self) -> SceneCamera:
+        if self.lens is not None and self.aberrations is not None:
+            raise ValueError("either lens or aberrations")
+        _ = self.lens_rays
         return self
 
     @model_validator(mode="after")
@@ -293,6 +303,13 @@ class SceneCamera(NominalCamera):
         return np.array([*lens.centre_mm, 1 / optics.pupil_radius_mm, 1 / field, *transverse])
 
     @property
+    def lens_rays(self) -> np.ndarray:
+        """Polynomial of a lens of surfaces for `real_optics.lens_offsets`, shape (term, 4); empty without."""
+        if self.lens is None or self.lens.file is not None:  # `open_scene` reads the file
+            return real_optics.NO_LENS[:0]
+        return self.lens.system(self.optics).ray_polynomial
+
+    @property
     def faults(self) -> np.ndarray:
         """Drift of the pitch and cat's eye in the form of `array_faults.Faults`, shape (3,)."""
         optics, array = self.optics, self.array or ArrayFaults()
@@ -324,15 +341,19 @@ def true_mapping(camera: SceneCamera | Mapping[str, Any]) -> Callable[[np.ndarra
     -------
     callable
         ``(points_mm (n, 3), pupil_mm (n, 2)) -> (s, t) (n, 2)`` [mm], origin at the sensor's centre: s = k u - m x_c of
-        the apparent point behind the windows, plus the aberrations of the lens.
+        the apparent point behind the windows, plus the aberrations of the lens. Behind a lens of surfaces rays that
+        meet the array far beyond the sensor are nan.
     """
     if not isinstance(camera, SceneCamera):
         camera = SceneCamera.model_validate(camera)
     optics, rotation, axis_point = camera.optics, camera.rotation, camera.axis_point_mm
-    plates, seidel = camera.plates, camera.seidel
+    plates, seidel, lens = camera.plates, camera.seidel, camera.lens_rays
+    scales = optics.object_distance_mm, optics.image_distance_mm
 
     def mapping(points_mm: np.ndarray, pupil_mm: np.ndarray) -> np.ndarray:
         local = (np.asarray(points_mm, float) - axis_point) @ rotation.T
+        if len(lens):
+            return real_optics.array_places(local, np.asarray(pupil_mm, float), *scales, plates, seidel, lens)
         if len(plates):
             local = real_optics.apparent_points(local, pupil_mm, optics.object_distance_mm, plates)
         m = optics.image_distance_mm / (optics.object_distance_mm - local[..., 2:])

@@ -50,11 +50,26 @@ def _to_nearest_dot(place, board):
 
 
 @ti.func
-def _real_distance(s, t, u, v, so, si, rotation, offset, board, plates: ti.template(), aberrations):
-    """Return the same distance through windows and aberrations [mm]; parameters as in `_dot_distance`."""
+def _real_distance(
+    s,
+    t,
+    u,
+    v,
+    so,
+    si,
+    rotation,
+    offset,
+    board,
+    plates: ti.template(),
+    aberrations,
+    lens_rays: ti.template(),
+    thick: ti.template(),
+):
+    """Return the same distance through windows and a real lens [mm]; parameters as in `_dot_distance`."""
     normal = ti.Vector([rotation[0, 2], rotation[1, 2], rotation[2, 2]])
     level = normal.dot(rotation @ (ti.Vector([0.0, 0.0, board[0]]) - offset))
-    hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, normal, level)
+    plane = ti.Vector([normal[0], normal[1], normal[2], level])
+    hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
     return _to_nearest_dot(rotation.transpose() @ hit + offset, board)
 
 
@@ -104,6 +119,8 @@ def _collect_pixels(
     first_j: ti.i32,
     plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
+    lens_rays: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.lens_offsets`
+    thick: ti.template(),  # whether the main lens is one of surfaces
     faults: array_faults.Faults,
     drifting: ti.template(),  # whether the pitch of the lenses drifts
     clipped: ti.template(),  # whether a second aperture clips the pupil
@@ -155,7 +172,8 @@ def _collect_pixels(
                         light = board[5] if hit[0] < board[4] else board[6]
                     else:
                         far = _real_distance(
-                            middle[0], middle[1], u, v, so, si, rotation, offset, board, plates, aberrations
+                            *(middle[0], middle[1], u, v, so, si, rotation, offset, board),
+                            *(plates, aberrations, lens_rays, thick),
                         )
                         even = ti.abs(far - board[4]) > widest
                         light = board[5] if far < board[4] else board[6]
@@ -177,7 +195,8 @@ def _collect_pixels(
                                         far = _dot_distance(s, t, u, v, so, si, rotation, offset, board)[0]
                                     else:
                                         far = _real_distance(
-                                            s, t, u, v, so, si, rotation, offset, board, plates, aberrations
+                                            *(s, t, u, v, so, si, rotation, offset, board),
+                                            *(plates, aberrations, lens_rays, thick),
                                         )
                                     light = board[5] if far < board[4] else board[6]
                             seen += light / count
@@ -212,10 +231,11 @@ def widest_spread(camera: RenderCamera, normal: np.ndarray, level_mm: float, see
     step = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     hits = []
     scales = (camera.object_distance_mm, camera.image_distance_mm)
+    optics = (camera.plates, camera.aberrations, camera.lens)
     for lens, pixel in ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1)):
         moved = 0.7072 * (lens * camera.pitch_mm + pixel * camera.pixel_mm / camera.sensor_per_pupil) * step
         start, direction = real_optics.object_lines(
-            array + 0.7072 * lens * camera.pitch_mm * step, pupil + moved, *scales, camera.plates, camera.aberrations
+            array + 0.7072 * lens * camera.pitch_mm * step, pupil + moved, *scales, *optics
         )
         hits.append(start + ((level_mm - start @ normal) / (direction @ normal))[:, None] * direction)
     return 1.3 * float(np.linalg.norm(np.array(hits[1:]) - hits[0], axis=-1).max())

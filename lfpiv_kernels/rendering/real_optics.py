@@ -1,4 +1,4 @@
-"""Real optics in front of the microlens array: plane-parallel windows and third-order aberrations of the main lens.
+"""Real optics in front of the microlens array: plane-parallel windows, and a main lens that is not thin.
 
 All coordinates are in the camera's frame: main lens at z = object distance, plane in focus at z = 0, pupil (u, v).
 
@@ -15,7 +15,9 @@ contracts by about E / (distance to the lens). From the sensor outwards T is kno
 Snell's law without approximation.
 
 *Aberrations.* A ray that an ideal lens brings to (s, t) on the array lands at (s, t) plus the gradient of Seidel's wave
-aberration; see `aberration_mm`.
+aberration; see `aberration_mm`. A *lens of surfaces* leads a ray to a place and a slope in the plane in focus that
+differ from the ideal lens's by a polynomial; see `lens_offsets`. Such rays are traced from the array outwards. A point
+finds its place on the array by iteration, until the ray back meets the point.
 
 NumPy functions compute in float64 and are the reference. Taichi functions do the same in float32 inside the renderer.
 """
@@ -39,6 +41,16 @@ STRONGEST = 0.5
 at least halves its error in each step, and no two rays through one pupil point cross."""
 STEEPEST = 0.05
 """Least cosine between a ray in air and a window's normal: 87 degrees of incidence. Hardly any steeper light enters."""
+
+LENS_FIELD = 1.25
+"""Largest distance from the sensor's centre at which a ray passes a lens of surfaces, in radii of the field."""
+LENS_STEPS = 6
+"""Iterations after which a ray that still lies beyond the field counts as lost."""
+LENS_POWERS = tuple((i, j, k) for i in range(4) for j in range(4 - i) for k in range(8 - i - j))
+"""Powers of h.h, h.p and p.p in the polynomial of a lens of surfaces: rays to fifteenth order, in the field to
+seventh."""
+NO_LENS = np.zeros((1, 4))
+"""Polynomial that stands in place of a lens of surfaces where there is none."""
 
 Aberrations = ti.types.vector(9, ti.f32)
 """Centre (s, t) [mm], 1 / pupil radius, 1 / field radius [1/mm], then spherical, coma, astigmatism, field curvature,
@@ -191,6 +203,35 @@ def steepest_aberration(aberrations: np.ndarray) -> float:
     return float(np.linalg.norm(np.stack(slopes, axis=-1), 2, axis=(-2, -1)).max())
 
 
+def lens_terms(h: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Return the products of h.h, h.p and p.p with `LENS_POWERS`, shape (..., term); h and p have shape (..., 2)."""
+    factors = [(a * b).sum(-1) for a, b in ((h, h), (h, p), (p, p))]
+    return np.stack([np.prod([f**e for f, e in zip(factors, one, strict=True)], axis=0) for one in LENS_POWERS], -1)
+
+
+def lens_offsets(array_mm: np.ndarray, pupil: np.ndarray, aberrations: np.ndarray, lens: np.ndarray) -> np.ndarray:
+    """Return how far rays behind a lens of surfaces are off an ideal lens's in the plane in focus.
+
+    Parameters
+    ----------
+    array_mm, pupil : ndarray, shape (..., 2)
+        Positions (s, t) and (u, v) of each ray [mm].
+    aberrations : ndarray, shape (9,)
+        In the order of `Aberrations`: the radii of pupil and field are used.
+    lens : ndarray, shape (term, 4)
+        Coefficients of `lens_terms`, with which h and p are multiplied in the place [mm], then in the slope.
+
+    Returns
+    -------
+    ndarray, shape (..., 2, 2)
+        Place [mm], then slope.
+    """
+    h, p = np.asarray(array_mm, float) * aberrations[3], np.asarray(pupil, float) * aberrations[2]
+    factors = lens_terms(h, p) @ np.asarray(lens, float).reshape(-1, 4)
+    found: np.ndarray = factors[..., 0::2, None] * h[..., None, :] + factors[..., 1::2, None] * p[..., None, :]
+    return found
+
+
 def object_lines(
     array_mm: np.ndarray,
     pupil: np.ndarray,
@@ -198,6 +239,7 @@ def object_lines(
     image_distance_mm: float,
     plates: np.ndarray,
     aberrations: np.ndarray,
+    lens: np.ndarray = NO_LENS[:0],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Trace rays from the microlens array back to the particles' side of the windows.
 
@@ -207,8 +249,8 @@ def object_lines(
         Positions (s, t) and (u, v) at which each ray meets the array and the pupil [mm].
     object_distance_mm, image_distance_mm : float
         Main lens to the plane in focus and to the array [mm].
-    plates, aberrations : ndarray
-        From `pack_plates`; in the order of `Aberrations`.
+    plates, aberrations, lens : ndarray
+        From `pack_plates`; in the order of `Aberrations`; for `lens_offsets`, empty without a lens of surfaces.
 
     Returns
     -------
@@ -225,6 +267,9 @@ def object_lines(
     nought = np.zeros((len(ideal), 1))
     start = np.hstack([-ideal * object_distance_mm / image_distance_mm, nought])
     direction = np.hstack([pupil / object_distance_mm + ideal / image_distance_mm, nought + 1])
+    if len(lens):
+        offset = lens_offsets(array_mm, pupil, aberrations, lens)
+        start, direction = start + np.hstack([offset[:, 0], nought]), direction + np.hstack([offset[:, 1], nought])
     if not len(plates):
         return start, direction
     tangents = [direction / (direction @ plate[:3])[:, None] - plate[:3] for plate in plates]
@@ -234,6 +279,43 @@ def object_lines(
     start = start + ((level - start @ normal) / (direction @ normal))[:, None] * direction
     slower = 1 - _shortening(medium, (tangents[0] ** 2).sum(1))
     return start, normal + slower[:, None] * tangents[0]
+
+
+def array_places(
+    points: np.ndarray,
+    pupil: np.ndarray,
+    object_distance_mm: float,
+    image_distance_mm: float,
+    plates: np.ndarray,
+    aberrations: np.ndarray,
+    lens: np.ndarray,
+) -> np.ndarray:
+    """Return where rays of points through pupil points meet the array behind a lens of surfaces, shape (n, 2) [mm].
+
+    `points` (n, 3) are in the camera's frame; for the others see `object_lines`. A ray beyond `LENS_FIELD` is nan.
+
+    Raises
+    ------
+    ValueError
+        If a ray does not converge.
+    """
+    points, pupil = np.asarray(points, float), np.asarray(pupil, float)
+    scale = image_distance_mm / (object_distance_mm - points[:, 2:])
+    found = scale * points[:, 2:] / object_distance_mm * pupil - scale * points[:, :2]
+    limit = LENS_FIELD / aberrations[3]
+    for number in range(STEPS):
+        far = np.maximum(np.linalg.norm(found, axis=1, keepdims=True) / limit, 1.0)
+        start, ray = object_lines(
+            found / far, pupil, object_distance_mm, image_distance_mm, plates, aberrations, lens
+        )  # at the rim for rays beyond it, where the polynomial is fitted
+        step = scale * (start + ((points[:, 2] - start[:, 2]) / ray[:, 2])[:, None] * ray - points)[:, :2]
+        found = found / far + step
+        inside = np.abs(step[far[:, 0] == 1])
+        if number >= LENS_STEPS and inside.max(initial=0) < TOLERANCE_MM * max(1.0, np.abs(found).max(initial=0)):
+            break
+    else:
+        raise ValueError(f"lens: rays through it did not converge, off by {inside.max():.1e} mm.")
+    return np.where(far > 1, np.nan, found)
 
 
 @ti.func
@@ -288,20 +370,26 @@ def aberration(s, t, u, v, lens):
 
 
 @ti.func
-def board_hit(s, t, u, v, so, si, plates: ti.template(), lens, normal, level):
-    """Return where the ray from (s, t) on the array through (u, v) on the pupil meets the plane normal . place = level.
+def board_hit(s, t, u, v, so, si, plates: ti.template(), errors, lens: ti.template(), thick: ti.template(), plane):
+    """Return where the ray from (s, t) on the array through (u, v) on the pupil meets a plane: normal (3) and level.
 
-    Float32 twin of `object_lines`. It has ten parameters because they are numbers of one ray, of the camera and of the
-    plane, which Taichi inlines.
+    Float32 twin of `object_lines`; `thick` says whether there is a lens of surfaces. It has eleven parameters because
+    they are numbers of one ray, of the camera and of the plane, which Taichi inlines.
     """
     ideal = ti.Vector([s, t])
-    for _step in range(STEPS_F32):
-        step = ti.Vector([s, t]) - aberration(ideal[0], ideal[1], u, v, lens) - ideal
-        ideal += step
-        if ti.abs(step).max() < TOLERANCE_F32_MM:
-            break
+    if ti.static(not thick):
+        for _step in range(STEPS_F32):
+            step = ti.Vector([s, t]) - aberration(ideal[0], ideal[1], u, v, errors) - ideal
+            ideal += step
+            if ti.abs(step).max() < TOLERANCE_F32_MM:
+                break
     start = ti.Vector([-ideal[0] * so / si, -ideal[1] * so / si, 0.0])
     direction = ti.Vector([u / so + ideal[0] / si, v / so + ideal[1] / si, 1.0])
+    if ti.static(thick):
+        offset = lens_offset(s * errors[3], t * errors[3], u * errors[2], v * errors[2], lens)
+        start += ti.Vector([offset[0], offset[1], 0.0])
+        direction += ti.Vector([offset[2], offset[3], 0.0])
+    normal, level = ti.Vector([plane[0], plane[1], plane[2]]), plane[3]
     shift = ti.Vector([0.0, 0.0, 0.0])
     for n in range(plates.shape[0]):
         across = ti.Vector([plates[n, 0], plates[n, 1], plates[n, 2]])
@@ -314,3 +402,51 @@ def board_hit(s, t, u, v, so, si, plates: ti.template(), lens, normal, level):
     start += (plates[0, 3] - inner.dot(start)) / direction.dot(inner) * direction
     inside = inner + slower * tangent
     return start + (level - normal.dot(start)) / normal.dot(inside) * inside
+
+
+@ti.func
+def lens_offset(h0, h1, p0, p1, lens: ti.template()):
+    """Float32 twin of `lens_offsets`: place, then slope."""
+    hh, hp, pp = h0 * h0 + h1 * h1, h0 * p0 + h1 * p1, p0 * p0 + p1 * p1
+    of_hh, of_hp, of_pp = ti.Vector([1.0] * 8), ti.Vector([1.0] * 8), ti.Vector([1.0] * 8)
+    for power in ti.static(range(1, 8)):
+        of_hh[power], of_hp[power] = of_hh[power - 1] * hh, of_hp[power - 1] * hp
+        of_pp[power] = of_pp[power - 1] * pp
+    factor = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    for i in ti.static(range(4)):
+        for j in ti.static(range(4 - i)):
+            for k in ti.static(range(8 - i - j)):
+                n = ti.static(LENS_POWERS.index((i, j, k)))
+                factor += of_hh[i] * of_hp[j] * of_pp[k] * ti.Vector([lens[n, o] for o in range(4)])
+    return ti.Vector(
+        [
+            factor[0] * h0 + factor[1] * p0,
+            factor[0] * h1 + factor[1] * p1,
+            factor[2] * h0 + factor[3] * p0,
+            factor[2] * h1 + factor[3] * p1,
+        ]
+    )
+
+
+@ti.func
+def array_place(place, start, u, v, so, si, plates: ti.template(), errors, lens: ti.template()):
+    """Return how far (s, t) is off an ideal lens's for the ray of a point through (u, v), iterated from `start`.
+
+    Float32 twin of `array_places`. The last number is 1 where the ray passes, 0 beyond `LENS_FIELD`.
+    """
+    m = si / (so - place[2])
+    k = m * place[2] / so
+    ideal = ti.Vector([k * u - m * place[0], k * v - m * place[1]])
+    off, passes = start, 1.0
+    limit = LENS_FIELD / errors[3]
+    for number in range(STEPS_F32):
+        at = ideal + off
+        far = ti.max(at.norm() / limit, 1.0)
+        at /= far
+        plane = ti.Vector([0.0, 0.0, 1.0, place[2]])
+        hit = board_hit(at[0], at[1], u, v, so, si, plates, errors, lens, True, plane)
+        step = m * ti.Vector([hit[0] - place[0], hit[1] - place[1]])
+        off, passes = at + step - ideal, ti.select(far > 1.0, 0.0, 1.0)
+        if (far > 1.0 and number >= LENS_STEPS) or (far == 1.0 and ti.abs(step).max() < TOLERANCE_F32_MM):
+            break
+    return ti.Vector([off[0], off[1], passes])

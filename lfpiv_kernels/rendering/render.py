@@ -68,13 +68,15 @@ class RenderCamera:
     """Windows between particles and lens, the one next to the particles first: `real_optics.pack_plates`."""
     aberrations: np.ndarray = field(default_factory=lambda: np.zeros(9))
     """Third-order aberrations of the main lens: `real_optics.Aberrations`."""
+    lens: np.ndarray = field(default_factory=lambda: real_optics.NO_LENS[:0])
+    """Polynomial of a main lens of surfaces: `real_optics.lens_offsets`; empty without."""
     faults: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Drift of the microlenses' pitch and cat's eye of the main lens: `array_faults.Faults`."""
 
     @property
     def ideal(self) -> bool:
         """Whether the camera is a thin lens without windows and aberrations."""
-        return len(self.plates) == 0 and not np.any(self.aberrations[4:])
+        return len(self.plates) == 0 and len(self.lens) == 0 and not np.any(self.aberrations[4:])
 
     @property
     def pitch_mm(self) -> float:
@@ -97,6 +99,8 @@ class RenderCamera:
             *map(int, self.first_lens),
             np.ascontiguousarray(self.plates if len(self.plates) else real_optics.NO_PLATE, np.float32),
             real_optics.Aberrations(*np.asarray(self.aberrations, float)),
+            np.ascontiguousarray(self.lens if len(self.lens) else real_optics.NO_LENS, np.float32),
+            len(self.lens) > 0,
             array_faults.Faults(*np.asarray(self.faults, float)),
             bool(np.any(self.faults[:2])),
             bool(self.faults[2]),
@@ -159,6 +163,8 @@ def _trace_sources(
     first_j: ti.i32,
     plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
+    lens_rays: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.lens_offsets`
+    thick: ti.template(),  # whether the main lens is one of surfaces
     faults: array_faults.Faults,
     drifting: ti.template(),  # whether the pitch of the lenses drifts
     clipped: ti.template(),  # whether a second aperture clips the pupil
@@ -182,6 +188,7 @@ def _trace_sources(
         roll_c, roll_s = spin[source, 2], spin[source, 3]
         size = extent[source]
         shift = ti.Vector([0.0, 0.0, 0.0])
+        off = ti.Vector([0.0, 0.0])
         for ray in range(task * per_task, ti.min(rays.shape[0], (task + 1) * per_task)):
             a, b = rays[ray, 0], rays[ray, 1]
             u, v = radius * (turn_c * a - turn_s * b), radius * (turn_s * a + turn_c * b)
@@ -189,13 +196,17 @@ def _trace_sources(
             place = middle + rotation @ (
                 size * ti.Vector([roll_c * a - roll_s * b, roll_s * a + roll_c * b, rays[ray, 4]])
             )
-            if ti.static(glass):
+            if ti.static(glass and not thick):
                 shift = real_optics.apparent_shift(place, shift, u, v, so, plates)
                 place += shift
             m = si / (so - place[2])
             k = m * place[2] / so  # 1 - si/f + si/d without its cancellation
             s, t = k * u - m * place[0], k * v - m * place[1]
             passes = True
+            if ti.static(thick):
+                found = real_optics.array_place(place, off, u, v, so, si, plates, aberrations, lens_rays)
+                off, passes = ti.Vector([found[0], found[1]]), found[2] > 0.0
+                s, t = s + off[0], t + off[1]
             if ti.static(aberrated):
                 passes = (s * s + t * t) * aberrations[3] ** 2 < real_optics.FIELD_STOP**2
                 error = real_optics.aberration(s, t, u, v, aberrations)

@@ -20,10 +20,23 @@ GAUSSIAN_REACH = 6.0
 
 
 @ti.func
-def _place(s, t, u, v, so, si, plates: ti.template(), aberrations, patch, ideal: ti.template()):
+def _place(
+    s,
+    t,
+    u,
+    v,
+    so,
+    si,
+    plates: ti.template(),
+    aberrations,
+    lens_rays: ti.template(),
+    thick: ti.template(),
+    patch,
+    ideal: ti.template(),
+):
     """Return where the ray from (s, t) through (u, v) meets the patch's plane: distances along and across [mm].
 
-    It has ten parameters because they are numbers of one ray, of the camera and of the patch, which Taichi inlines.
+    It has twelve parameters because they are numbers of one ray, of the camera and of the patch, which Taichi inlines.
     """
     along = ti.Vector([patch[3], patch[4], patch[5]])
     across = ti.Vector([patch[6], patch[7], patch[8]])
@@ -34,7 +47,8 @@ def _place(s, t, u, v, so, si, plates: ti.template(), aberrations, patch, ideal:
         slope = ti.Vector([u / so + s / si, v / so + t / si, 1.0])
         hit = start + (patch[13] - normal.dot(start)) / normal.dot(slope) * slope
     else:
-        hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, normal, patch[13])
+        plane = ti.Vector([normal[0], normal[1], normal[2], patch[13]])
+        hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
     arm = hit - ti.Vector([patch[0], patch[1], patch[2]])
     place = ti.Vector([arm.dot(along), arm.dot(across)])
     if not hit[2] < so:  # the plane meets the ray behind the lens, or never
@@ -64,6 +78,8 @@ def _collect_patch(
     first_j: ti.i32,
     plates: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.pack_plates`
     aberrations: real_optics.Aberrations,
+    lens_rays: ti.types.ndarray(dtype=ti.f32, ndim=2),  # `real_optics.lens_offsets`
+    thick: ti.template(),  # whether the main lens is one of surfaces
     faults: array_faults.Faults,
     drifting: ti.template(),  # whether the pitch of the lenses drifts
     clipped: ti.template(),  # whether a second aperture clips the pupil
@@ -105,7 +121,9 @@ def _collect_patch(
             if on_array and distance < outer:
                 seen = 0.0
                 u0, v0 = middle[0] - (x - middle[0]) / scale, middle[1] - (y - middle[1]) / scale
-                far = ti.abs(_place(middle[0], middle[1], u0, v0, so, si, plates, aberrations, patch, ideal))
+                far = ti.abs(
+                    _place(*(middle[0], middle[1], u0, v0, so, si, plates, aberrations, lens_rays, thick, patch, ideal))
+                )
                 rays = 0
                 if far[0] < dark[0] and far[1] < dark[1]:
                     rays = count
@@ -117,7 +135,7 @@ def _collect_patch(
                     if ti.static(clipped):
                         open_ = open_ and array_faults.passes(s, t, u, v, radius, faults)
                     if open_:
-                        place = _place(s, t, u, v, so, si, plates, aberrations, patch, ideal)
+                        place = _place(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, patch, ideal)
                         light = _edge(place[0], patch[9], patch[11]) * _edge(place[1], patch[10], patch[12])
                         seen += light / count
                 total += seen * lens_gain[i, j]

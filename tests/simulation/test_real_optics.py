@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import fsolve
 from scipy.stats import qmc
 from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
-from support.simulated_cameras import SMALL_SCENE, camera, land, lens_gain, points, relative_difference
+from support.simulated_cameras import SMALL_SCENE, camera, land, lens_gain, points, relative_difference, snell
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -49,13 +49,6 @@ def pupil_points(count, radius=12.5, seed=3):
     rng = np.random.default_rng(seed)
     length, angle = radius * np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
     return np.stack([length * np.cos(angle), length * np.sin(angle)], 1)
-
-
-def snell(direction, normal, before, after):
-    """Return the refracted unit direction by the vector form of Snell's law. `normal` points along the light."""
-    cosine = direction @ normal
-    across = before / after * (direction - cosine * normal)
-    return across + np.sqrt(1 - across @ across) * normal
 
 
 def forward(direction, point, scene_camera):

@@ -147,3 +147,10 @@ def land(scene_camera, renderer, s_t, pupil, weight):
 
 def relative_difference(found, expected):
     return np.abs(found - expected).sum() / np.abs(expected).sum()
+
+
+def snell(direction, normal, before, after):
+    """Return the refracted unit direction by the vector form of Snell's law. `normal` points along the light."""
+    cosine = direction @ normal
+    across = before / after * (direction - cosine * normal)
+    return across + np.sqrt(1 - across @ across) * normal
