@@ -67,6 +67,7 @@ MAY_IMPORT["runs"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}
 MAY_IMPORT["planning"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}
 MAY_IMPORT["reproduce"] = set(MAY_IMPORT) - GROUND
 MAY_IMPORT["benchmark"] = {"simulation", "metrics", "results", "report", "experiment"}
+MAY_IMPORT["studio"] = set(MAY_IMPORT) - GROUND | {"lfpiv"}  # it calls what users call
 MAY_IMPORT["cli"] = set(MAY_IMPORT) - GROUND
 """What each room of `lfpiv` may import beside itself and `GROUND`. Rooms of the ground import only what stands here."""
 

@@ -312,6 +312,24 @@ def _export(
     _output.show({"files": [str(path) for path in written], "left_out": left_out}, lambda: terminal.say(text))
 
 
+@_command("studio", "lfpiv studio experiment.toml", "lfpiv studio results", "lfpiv studio --no-browser --port 8100")
+def _studio(
+    path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[EXPERIMENT.toml | RESULTS]", help="Experiment file, folder of a run, or a folder with either."
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", metavar="N", help="Port of this machine; default: a free one.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Look, tune and run on a page in the browser; only this machine can open it. Needs the extra `studio`."""
+    with _output.progress():
+        from lfpiv.studio.server import serve
+
+        serve(path, port=port, browser=browser, ready=lambda address: terminal.say(f"studio: {address}", flush=True))
+
+
 @_command("simulate", "lfpiv simulate scene.toml --out data")
 def _simulate(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Rig, flow and noise to simulate.")],

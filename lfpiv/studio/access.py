@@ -1,0 +1,119 @@
+"""Who may ask the studio, and for which files: a token in the address, this machine's names, and the folders given."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from aiohttp import web
+
+from lfpiv.errors import InputError, printable
+
+HOSTS = ("127.0.0.1", "localhost")
+"""Names by which a browser of this machine asks."""
+DEEPEST = 3
+"""Levels of folders below a given one that are searched for experiments and results."""
+MOST_FOLDERS = 5000
+"""Largest number of folders that are searched."""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True)
+class Token:
+    """A random word that the address of the page holds; a cookie keeps it afterwards."""
+
+    word: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    def middleware(self) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
+        """Return what refuses requests without the token, by other names of this machine, or from other pages."""
+
+        @web.middleware
+        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+            host = urlsplit(f"//{request.headers.get('Host', '')}")
+            origin = request.headers.get("Origin")
+            if host.hostname not in HOSTS or (origin and urlsplit(origin).netloc != host.netloc):
+                raise web.HTTPForbidden(text="lfpiv studio answers its own page only.")
+            name, asked = f"lfpiv_{host.port}", request.query.get("token", "")
+            known = (asked, request.cookies.get(name, ""))
+            if not any(hmac.compare_digest(word.encode(), self.word.encode()) for word in known):
+                raise web.HTTPForbidden(text="Open the address that lfpiv studio printed; it holds a token.")
+            try:
+                response = await handler(request)
+            except web.HTTPException as error:
+                response = error
+            if asked and not response.prepared:
+                response.set_cookie(name, self.word, httponly=True, samesite="Strict")
+            if not response.prepared:
+                response.headers["Referrer-Policy"] = "no-referrer"
+            return response
+
+        return guard
+
+
+@dataclass(frozen=True)
+class Places:
+    """The folders that the studio was given. It opens nothing outside them on behalf of the page."""
+
+    roots: tuple[Path, ...]
+
+    def within(self, text: str | Path) -> Path:
+        """Return a path if it lies in a given folder, links followed.
+
+        Raises
+        ------
+        InputError
+            If it lies outside.
+        """
+        path = Path(os.path.expanduser(text))
+        path = (path if path.is_absolute() else self.roots[0] / path).resolve()
+        if not any(path == root or root in path.parents for root in self.roots):
+            listed = ", ".join(map(str, self.roots))
+            raise InputError(f"{path}: expected a place in {listed}. Start `lfpiv studio` with a folder above it.")
+        return path
+
+    def name(self, path: Path) -> str:
+        """Return a path as the page shows it: relative to the first folder where it lies there."""
+        root = self.roots[0]
+        return printable(str(path.relative_to(root)) if path != root and root in path.parents else str(path))
+
+    def folders(self) -> Iterator[Path]:
+        """Yield given folders and those below, hidden ones left out, no link followed."""
+        todo, count = [(root, 0) for root in self.roots], 0
+        while todo and count < MOST_FOLDERS:
+            folder, depth = todo.pop(0)
+            yield folder
+            count += 1
+            if depth < DEEPEST:
+                try:
+                    with os.scandir(folder) as entries:
+                        inner = sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
+                except OSError:
+                    continue
+                todo += [(folder / name, depth + 1) for name in inner if not name.startswith(".")]
+
+    def experiments(self) -> list[Path]:
+        """Return the experiment files in the folders: TOML files with a table of cameras and one of a volume."""
+        found = []
+        for folder in self.folders():
+            for path in sorted(folder.glob("*.toml"))[:50]:
+                try:
+                    text = path.read_text("utf-8", errors="replace")[:200_000]
+                except OSError:
+                    continue
+                if "[[camera]]" in text and "[volume]" in text and "white_image" in text:
+                    found.append(path)
+        return found
+
+    def results(self) -> list[Path]:
+        """Return the folders of runs: those with vectors, or a calibration."""
+        return [
+            folder
+            for folder in self.folders()
+            if any((folder / "vectors").glob("*.nc")) or (folder / "calibration.h5").is_file()
+        ]

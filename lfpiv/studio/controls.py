@@ -1,0 +1,40 @@
+"""Pieces of the page that several tabs use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import trame_client.widgets.html as html
+from trame.widgets import vuetify3 as v3
+
+
+def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str = "", **more: Any) -> None:
+    """Show a slider of a value of the state, with a field beside it in which the value is typed."""
+    with html.Div(classes="lf-slider", **more):
+        html.Label(f"{label}{f' [{unit}]' if unit else ''}", for_=f"s-{name}")
+        v3.VSlider(
+            v_model=(name,), min=low, max=high, step=step, density="compact", hide_details=True, id=f"s-{name}",
+            thumb_size=14, track_size=3, aria_label=label,
+        )  # fmt: skip
+        html.Input(
+            type="number", value=(name,), step="any", aria_label=f"{label}, typed", id=f"n-{name}",
+            change=f"{name} = Number($event.target.value)",
+        )  # fmt: skip
+
+
+def choice(name: str, label: str, items: Any, **more: Any) -> None:
+    """Show a list to choose from."""
+    v3.VSelect(
+        v_model=(name,), label=label, items=items, density="compact", hide_details=True, variant="outlined", **more
+    )
+
+
+def switch(name: str, label: str, **more: Any) -> None:
+    """Show a box to tick."""
+    v3.VCheckbox(v_model=(name,), label=label, density="compact", hide_details=True, **more)
+
+
+def button(label: str, click: Any, icon: str = "", **more: Any) -> None:
+    """Show a button."""
+    options = {"prepend_icon": icon} if icon else {}
+    v3.VBtn(label, click=click, size="small", variant="tonal", **options, **more)

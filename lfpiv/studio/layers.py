@@ -1,0 +1,133 @@
+"""Layers of a picture of vectors, made with PyVista. "Copy as Python" copies this file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyvista as pv
+import xarray as xr
+
+import lfpiv
+
+SEEDS_RADIUS = 0.45
+"""Radius of the ball in which streamlines start, as a share of the volume's diagonal."""
+
+
+def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
+    """Return the vectors of one pair or instant, or a statistic over all of them: "mean" or "fluctuations"."""
+    dimension = "instant" if "instant" in results.dims else "pair"
+    if moment == "mean":
+        return lfpiv.statistics.mean(results)
+    if moment == "fluctuations":
+        spread, stresses = lfpiv.statistics.rms(results), lfpiv.statistics.reynolds_stresses(results)
+        energy = lfpiv.statistics.turbulent_kinetic_energy(results).rename("turbulent_kinetic_energy")
+        return xr.merge([lfpiv.statistics.mean(results), spread, stresses, energy], compat="override")
+    return results.sel({dimension: int(moment)})
+
+
+def grid_of(vectors: xr.Dataset) -> pv.ImageData:
+    """Return vectors and what is derived of them as point data on an even grid [mm]."""
+    vectors = vectors.load()
+    axes = [np.asarray(vectors[axis], float) for axis in "xyz"]
+    steps = [np.ptp(axis) / (len(axis) - 1) if len(axis) > 1 else 1.0 for axis in axes]
+    grid = pv.ImageData(dimensions=[len(axis) for axis in axes], spacing=steps, origin=[axis[0] for axis in axes])
+    fields = {name: item for name, item in vectors.data_vars.items() if set(item.dims) == set("zyx")}
+    if min(len(axis) for axis in axes) > 2:
+        fields |= dict(lfpiv.derived.vorticity(vectors).data_vars)
+        fields["q_criterion"] = lfpiv.derived.q_criterion(vectors)
+        fields["divergence"] = lfpiv.derived.divergence(vectors)
+    for name, field in fields.items():
+        grid[name] = np.ascontiguousarray(field.transpose("z", "y", "x"), np.float32).ravel()
+    grid["velocity"] = np.column_stack([grid[name] for name in "uvw"])
+    grid["speed"] = np.linalg.norm(grid["velocity"], axis=1)
+    return grid
+
+
+def trusted(grid: pv.ImageData, replaced: bool, uncertainty: float | None) -> pv.ImageData:
+    """Return a grid whose fields are NaN where vectors are replaced, or more uncertain than a limit [voxel]."""
+    hidden = np.zeros(grid.n_points, bool)
+    if replaced and "valid" in grid.point_data:
+        hidden |= grid["valid"] < 0.5
+    if uncertainty is not None and "uncertainty" in grid.point_data:
+        hidden |= ~(grid["uncertainty"] <= uncertainty)
+    if not hidden.any():
+        return grid
+    shown = grid.copy(deep=False)
+    for name in grid.point_data:
+        if name not in ("valid", "uncertainty"):
+            values = np.array(grid[name])
+            values[hidden] = np.nan
+            shown[name] = values
+    return shown
+
+
+def slice_at(grid: pv.ImageData, axis: str, at_mm: float) -> pv.DataSet:
+    """Return the plane normal to an axis at a place [mm]."""
+    origin = list(grid.center)
+    low, high = grid.bounds[2 * "xyz".index(axis) :][:2]
+    origin["xyz".index(axis)] = min(max(at_mm, low + 1e-9), high - 1e-9)
+    return grid.slice(normal=axis, origin=origin)
+
+
+def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.PolyData:
+    """Return the surface on which a field has a level, with the field that colours it."""
+    slim = pv.ImageData(dimensions=grid.dimensions, spacing=grid.spacing, origin=grid.origin)
+    for name in (field, colour):
+        slim[name] = np.nan_to_num(grid[name], nan=np.float32(np.nanmin(grid[name], initial=0.0)))
+    return slim.contour([level], scalars=field)
+
+
+def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.PolyData:
+    """Return arrows on every n-th vector along each axis, or on the replaced vectors among them.
+
+    The fastest arrow is as long as `length` distances of the arrows.
+    """
+    index = [np.arange((n - 1) % every // 2, n, every) for n in grid.dimensions]
+    x, y, z = np.meshgrid(*index, indexing="ij")
+    chosen = (x + grid.dimensions[0] * (y + grid.dimensions[1] * z)).ravel()
+    good = grid["valid"][chosen] > 0.5 if "valid" in grid.point_data else np.ones(len(chosen), bool)
+    chosen = chosen[(good != flagged) & np.isfinite(grid["speed"][chosen])]
+    cloud = pv.PolyData(np.asarray(grid.points)[chosen]) if len(chosen) else pv.PolyData()
+    if not len(chosen):
+        return cloud
+    for name in grid.point_data:
+        cloud[name] = grid[name][chosen]
+    fastest = float(np.nanmax(grid["speed"], initial=0.0)) or 1.0
+    factor = length * every * min(grid.spacing) / fastest
+    return cloud.glyph(
+        orient="velocity", scale="speed", factor=factor, geom=pv.Arrow(tip_resolution=8, shaft_resolution=6)
+    )
+
+
+def stream_lines(grid: pv.ImageData, seeds: int) -> pv.PolyData:
+    """Return streamlines from a number of points in the volume, drawn as tubes."""
+    filled = grid.copy(deep=False)
+    filled["velocity"] = np.nan_to_num(grid["velocity"])
+    low, high = np.array(grid.bounds[::2]), np.array(grid.bounds[1::2])
+    places = low + (high - low) * np.random.default_rng(0).random((seeds, 3))
+    lines = filled.streamlines_from_source(
+        pv.PolyData(places), vectors="velocity", integration_direction="both", max_length=4 * grid.length
+    )
+    return lines.tube(radius=grid.length / 500, n_sides=6) if lines.n_points else lines
+
+
+def points_of(table: xr.Dataset, columns: tuple[str, str, str]) -> pv.PolyData:
+    """Return particles as points, coloured by their speed [m/s] where it is known."""
+    good = table["valid"].values if "valid" in table else np.ones(table.sizes["particle"], bool)
+    cloud = pv.PolyData(np.column_stack([table[name].values[good] for name in columns]).astype(np.float32))
+    if "u" in table:
+        cloud["speed"] = np.sqrt(sum(table[name].values[good] ** 2 for name in "uvw")).astype(np.float32)
+    return cloud
+
+
+def track_lines(table: xr.Dataset, columns: tuple[str, str, str], until: int | None = None) -> pv.PolyData:
+    """Return the tracks of particles as lines, up to an instant if it is given."""
+    good = table["valid"].values.astype(bool)
+    if until is not None and "instant" in table:
+        good &= table["instant"].values <= until
+    places = np.column_stack([table[name].values[good] for name in columns]).astype(np.float32)
+    ends = np.flatnonzero(np.diff(table["track"].values[good])) + 1
+    parts = [part for part in np.split(np.arange(len(places)), ends) if len(part) > 1]
+    lines = pv.PolyData(places, lines=np.concatenate([[len(part), *part] for part in parts]) if parts else None)
+    if "u" in table:
+        lines["speed"] = np.sqrt(sum(table[name].values[good] ** 2 for name in "uvw")).astype(np.float32)
+    return lines

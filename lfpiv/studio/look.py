@@ -1,0 +1,227 @@
+"""What a picture of vectors shows, drawn with PyVista layer by layer, and as a script that draws the same."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+
+from lfpiv.studio import layers
+
+BACKGROUND = {"light": "white", "dark": "#16191d"}
+INK = {"light": "#202327", "dark": "#e6e8ea"}
+REPLACED = "#8a8f98"
+"""Colour of vectors that are replaced."""
+SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
+"""Fields whose colours are centred on zero."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is shown of a field of vectors."""
+
+    moment: str = "0"
+    """Number of a pair or instant, "mean" or "fluctuations"."""
+    colour: str = "speed"
+    """Field that colours slices, surface, arrows and streamlines."""
+    colours: str = "viridis"
+    """Name of the colour map."""
+    limits: tuple[float, float] | None = None
+    """Ends of the colour scale; None for the field's own."""
+    slices: tuple[float | None, float | None, float | None] = (None, None, 0.0)
+    """Place of the planes normal to x, y, z [mm]; None for none."""
+    surface: str | None = None
+    """Field of the isosurface; None for none."""
+    level: float = 0.0
+    opacity: float = 1.0
+    """Opacity of the isosurface."""
+    arrows: int = 0
+    """Arrows on every n-th vector; 0 for none."""
+    length: float = 1.5
+    """Length of the longest arrow [spacing of the arrows]."""
+    replaced: bool = False
+    """Whether replaced vectors are shown as grey arrows."""
+    hide_replaced: bool = True
+    """Whether slices, surface and streamlines leave out replaced vectors."""
+    uncertainty: float | None = None
+    """Vectors that are more uncertain are left out [voxel]; None for all."""
+    lines: int = 0
+    """Number of streamlines."""
+    particles: bool = False
+    tracks: bool = False
+    theme: str = "light"
+
+
+def own_limits(grid: pv.ImageData, name: str) -> tuple[float, float]:
+    """Return the ends of the colour scale of a field: its 1st and 99th percentile, even about zero if it is signed."""
+    values = grid[name][np.isfinite(grid[name])] if name in grid.point_data else np.zeros(0)
+    if not values.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(values, (1, 99)))
+    if name in SIGNED:
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    return (low, high) if high > low else (low - 0.5, low + 0.5)
+
+
+@dataclass
+class Picture:
+    """A plotter that shows a look, and draws anew only the layers that changed."""
+
+    plotter: pv.Plotter
+    drawn: dict[str, Any] = field(default_factory=dict)
+    """Layer -> what it was drawn from."""
+    placed: bool = False
+    """Whether the camera looks at the volume."""
+
+    @classmethod
+    def empty(cls, size: tuple[int, int] = (900, 650)) -> Picture:
+        """Return a picture without layers, drawn off the screen."""
+        plotter = pv.Plotter(off_screen=True, window_size=list(size))
+        plotter.render_window.SetMultiSamples(0)  # twice to four times as slow in software
+        return cls(plotter)
+
+    def show(self, whole: pv.ImageData, look: Look, clouds: dict[str, pv.PolyData], title: str) -> None:
+        """Draw what differs from what is drawn."""
+        self.drawn["whole"] = whole  # its id names it as long as it lives
+        grid, key = whole, (id(whole), look.hide_replaced, look.uncertainty)
+        if self.drawn.get("trusted key") != key:
+            self.drawn |= {"trusted key": key, "trusted": layers.trusted(whole, look.hide_replaced, look.uncertainty)}
+        grid = self.drawn["trusted"]
+        limits = look.limits or self.limits(whole, look.colour)
+        ink, paint = INK[look.theme], {"cmap": look.colours, "clim": list(limits), "scalars": look.colour}
+        shade = (look.colour, look.colours, limits, look.theme, title)
+        bar = {
+            "title": title, "color": ink, "vertical": True, "fmt": "%.3g", "position_x": 0.9, "position_y": 0.2,
+            "width": 0.05, "height": 0.6, "n_labels": 5, "title_font_size": 15, "label_font_size": 13,
+            "unconstrained_font_size": True,
+        }  # fmt: skip
+        for axis, at in zip("xyz", look.slices, strict=True):
+            self._layer(
+                f"slice {axis}", None if at is None else (key, at, shade),
+                lambda axis=axis, at=at: layers.slice_at(grid, axis, at), **paint, lighting=False, nan_opacity=0.0,
+            )  # fmt: skip
+        self._layer(
+            "surface", look.surface and (key, look.surface, look.level, look.opacity, shade),
+            lambda: layers.surface(grid, look.surface, look.level, look.colour), **paint, opacity=look.opacity,
+            smooth_shading=True,
+        )  # fmt: skip
+        self._layer(
+            "arrows", look.arrows and (key, look.arrows, look.length, shade),
+            lambda: layers.arrows(grid, look.arrows, look.length, False), **paint,
+        )  # fmt: skip
+        self._layer(
+            "replaced", look.replaced and (id(whole), look.arrows, look.length),
+            lambda: layers.arrows(whole, max(look.arrows, 1), look.length, True), color=REPLACED,
+        )  # fmt: skip
+        self._layer(
+            "lines", look.lines and (key, look.lines, shade), lambda: layers.stream_lines(grid, look.lines), **paint
+        )
+        for name, style in (("particles", {"point_size": 4.0}), ("tracks", {"line_width": 2.0})):
+            cloud = clouds.get(name) if getattr(look, name) else None
+            colour = paint if cloud is not None and look.colour in cloud.point_data else {"color": ink}
+            self._layer(name, cloud is not None and (id(cloud), shade), lambda cloud=cloud: cloud, **colour, **style)
+        if self.drawn.get("frame") != (id(whole), shade):
+            self._frame(whole, ink, BACKGROUND[look.theme], bar, paint)
+            self.drawn["frame"] = (id(whole), shade)
+
+    def limits(self, grid: pv.ImageData, name: str) -> tuple[float, float]:
+        """Return the ends of the colour scale of a field, which are computed once."""
+        if self.drawn.get("limits key") != (id(grid), name):
+            self.drawn |= {"limits key": (id(grid), name), "limits": own_limits(grid, name)}
+        return self.drawn["limits"]  # type: ignore[no-any-return]
+
+    def _layer(self, name: str, key: Any, make: Any, **style: Any) -> None:
+        """Draw a layer unless it is drawn from the same; remove it without a key."""
+        if not key:
+            if self.drawn.pop(name, None) is not None:
+                self.plotter.remove_actor(name, render=False)
+            return
+        if self.drawn.get(name) == key:
+            return
+        mesh = make()
+        if not mesh.n_points:
+            self.plotter.remove_actor(name, render=False)
+        else:
+            self.plotter.add_mesh(mesh, name=name, show_scalar_bar=False, reset_camera=False, render=False, **style)
+        self.drawn[name] = key
+
+    def _frame(self, grid: pv.ImageData, ink: str, ground: str, bar: dict[str, Any], paint: dict[str, Any]) -> None:
+        """Draw background, box, axes and colour scale."""
+        plotter = self.plotter
+        plotter.set_background(ground)
+        plotter.add_mesh(grid.outline(), color=ink, name="outline", reset_camera=False, render=False)
+        plotter.remove_bounds_axes()
+        plotter.show_bounds(
+            bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=9, n_xlabels=4,
+            n_ylabels=4, n_zlabels=3, location="outer", grid=False, ticks="outside", fmt="%.3g", use_3d_text=False,
+            render=False,
+        )  # fmt: skip
+        if plotter.scalar_bars:
+            plotter.remove_scalar_bar(render=False)
+        scale = pv.Plane(i_resolution=1, j_resolution=1)
+        scale[paint["scalars"]] = np.linspace(*paint["clim"], scale.n_points)
+        actor = plotter.add_mesh(
+            scale, name="scale", scalars=paint["scalars"], cmap=paint["cmap"], clim=paint["clim"],
+            scalar_bar_args=bar, reset_camera=False, render=False,
+        )  # fmt: skip
+        actor.SetVisibility(False)
+        if not self.placed:
+            plotter.camera_position = "xy"
+            plotter.camera.azimuth, plotter.camera.elevation = 25.0, 20.0
+            plotter.reset_camera(bounds=grid.bounds, render=False)
+            plotter.camera.zoom(0.85)
+            self.placed = True
+
+    def image(self) -> np.ndarray:
+        """Return the picture, shape (rows, columns, 3)."""
+        self.plotter.show(auto_close=False, interactive=False)
+        return np.asarray(self.plotter.screenshot(return_img=True))
+
+
+def script(look: Look, results: str, title: str, camera: Any, size: tuple[int, int]) -> str:
+    """Return a program that draws a look of the results in a folder as the studio does, into ``picture.png``.
+
+    Parameters
+    ----------
+    look : Look
+    results : str
+        Folder of a run, or a store.
+    title : str
+        Title of the colour scale.
+    camera
+        Position, focal point and direction upwards.
+    size : (int, int)
+        Columns and rows of the picture.
+    """
+    body = inspect.getsource(layers).partition("from __future__ import annotations\n")[2]
+    own = (
+        inspect.getsource(inspect.getmodule(Look)).partition("\n\nBACKGROUND = {")[2].rpartition("\n\n\ndef script(")[0]
+    )
+    stated = [
+        (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
+    ]
+    values = "".join(f"    {name}={value!r},\n" for name, value in stated)
+    clouds = ""
+    if look.particles:
+        table = f"lfpiv.open_particles(RESULTS, pairs=({look.moment}, {look.moment} + 1))"
+        clouds += f'clouds["particles"] = points_of({table}, ("x", "y", "z"))\n'
+    if look.tracks:
+        until = look.moment if look.moment.isdigit() else None
+        clouds += f'clouds["tracks"] = track_lines(lfpiv.open_tracks(RESULTS), ("x", "y", "z"), {until})\n'
+    return (
+        '"""Draw vectors as they were seen in lfpiv studio. Needs lfpiv and pyvista."""\n\n'
+        "from __future__ import annotations\n\nfrom dataclasses import dataclass, field\nfrom typing import Any\n"
+        f"{body}\n\nBACKGROUND = {{{own.replace('layers.', '')}\n\n\n"
+        f"RESULTS = {results!r}\nLOOK = Look(\n{values})\n\n"
+        "grid = grid_of(field_at(lfpiv.open_results(RESULTS), LOOK.moment))\n"
+        f"clouds = {{}}\n{clouds}"
+        f"picture = Picture.empty({tuple(size)!r})\n"
+        f"picture.show(grid, LOOK, clouds, {title!r})\n"
+        f"picture.plotter.camera_position = {camera!r}\n"
+        "picture.plotter.renderer.reset_camera_clipping_range()\n"
+        "picture.image()\n"
+        'picture.plotter.screenshot("picture.png")\n'
+    )

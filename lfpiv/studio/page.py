@@ -1,0 +1,98 @@
+"""The page: a bar with what is open, tabs, and messages. Tabs are built by their own modules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import trame_client.widgets.html as html
+from aiohttp import web
+from trame.app import get_server
+from trame.ui.vuetify3 import VAppLayout
+from trame.widgets import vuetify3 as v3
+
+from lfpiv.results.stores import is_store
+from lfpiv.studio import results_tab
+from lfpiv.studio.access import Places
+from lfpiv.studio.session import Session
+
+TABS = {"results": ("Results", results_tab)}
+"""Name of a tab -> its title, and the module that builds it."""
+
+ENCODED_S = 0.01
+"""Time after which the server looks for an encoded picture again [s]."""
+
+
+def build(given: Path) -> Session:
+    """Build the page for an experiment file, results of a run, or a folder with either."""
+    server = get_server("lfpiv studio", client_type="vue3")
+    static = Path(__file__).parent / "static"
+    server.enable_module(
+        {"serve": {"lfpiv_studio": str(static)}, "scripts": ["lfpiv_studio/studio.js"],
+         "styles": ["lfpiv_studio/studio.css"], "vue_use": ["lfpivStudio"]}
+    )  # fmt: skip
+    session = Session(server, Places(roots_of(given)))
+    _open(session, given)
+    state = server.state
+    state.update({"tab": "results" if session.results else next(iter(TABS)), "theme": "light", "message": ""})
+    state.update({"message_shown": False, "trame__title": "lfpiv studio"})
+    with VAppLayout(server, theme=("theme",)):
+        _bar(session)
+        with v3.VMain():
+            for name, (_, module) in TABS.items():
+                with html.Div(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
+                    module.build(session)
+        v3.VSnackbar(
+            "{{ message }}", v_model=("message_shown",), timeout=15000, multi_line=True, location="top", color="error",
+            classes="lf-message",
+        )  # fmt: skip
+    server.add_protocol_to_configure(_deliver_soon)
+    session.changed("experiment")
+    session.changed("results")
+    return session
+
+
+def _deliver_soon(protocol: Any) -> None:
+    """Send a picture as soon as it is encoded. trame-vtk looks again half a second later otherwise."""
+    for part in protocol.getLinkProtocols():
+        if hasattr(part, "delta_stale_time_before_render"):
+            part.delta_stale_time_before_render = ENCODED_S
+
+
+def routes(session: Session) -> list[web.RouteDef]:
+    """Return the addresses beside the page, all guarded by the token."""
+    return []
+
+
+def roots_of(given: Path) -> tuple[Path, ...]:
+    """Return the folders that may be looked at: the folder that is given, or that of a file, a run or a store."""
+    return (given if given.is_dir() and not is_store(given) and not _is_run(given) else given.parent,)
+
+
+def _is_run(folder: Path) -> bool:
+    return (folder / "vectors").is_dir() or (folder / "summary.json").is_file()
+
+
+def _open(session: Session, given: Path) -> None:
+    """Open what was given, and what belongs to it."""
+    if given.is_file() and given.suffix == ".toml":
+        session.experiment = given
+    elif is_store(given) or _is_run(given):
+        session.results = given
+    experiments, results = session.places.experiments(), session.places.results()
+    if session.experiment is None and len(experiments) == 1:
+        session.experiment = experiments[0]
+    if session.results is None and results:
+        session.results = results[0]
+
+
+def _bar(session: Session) -> None:
+    with v3.VAppBar(density="compact", flat=True, border=True):
+        html.Div("lfpiv studio", classes="lf-brand")
+        with v3.VTabs(v_model=("tab",), density="compact", show_arrows=True, classes="lf-tabs"):
+            for name, (title, _) in TABS.items():
+                v3.VTab(title, value=name)
+        v3.VBtn(
+            icon=("theme === 'light' ? 'mdi-weather-night' : 'mdi-weather-sunny'",),
+            click="theme = theme === 'light' ? 'dark' : 'light'", size="small", title="light or dark", id="theme",
+        )  # fmt: skip

@@ -1,0 +1,480 @@
+"""Tab of the results: vectors in space, turned, sliced and coloured; two runs side by side."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+import trame_client.widgets.html as html
+import xarray as xr
+from trame.widgets import vtk as vtk_widgets
+from trame.widgets import vuetify3 as v3
+
+import lfpiv
+from lfpiv.errors import InputError
+from lfpiv.studio import charts, controls, layers, look
+from lfpiv.studio.session import Session
+
+LABELS = {
+    "speed": ("speed", "m/s"), "u": ("u", "m/s"), "v": ("v", "m/s"), "w": ("w", "m/s"),
+    "vorticity_magnitude": ("vorticity", "1/s"), "vorticity_x": ("vorticity x", "1/s"),
+    "vorticity_y": ("vorticity y", "1/s"), "vorticity_z": ("vorticity z", "1/s"), "q_criterion": ("Q", "1/s²"),
+    "divergence": ("divergence", "1/s"), "pressure": ("pressure", "Pa"), "uncertainty": ("uncertainty", "voxel"),
+    "peak_ratio": ("peak ratio", ""), "correlation": ("correlation", ""), "valid": ("valid", ""),
+}  # fmt: skip
+"""Fields in the order of the lists, what people call them, and their units. Others follow by their names."""
+SURFACES = ("speed", "vorticity_magnitude", "q_criterion", "pressure", "u", "v", "w", "uncertainty")
+"""Fields that have isosurfaces."""
+COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
+FRAMES_PER_S = 8
+"""Pictures of a film per second of a series; a turn takes 60 pictures at three times the rate."""
+VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "oblique"}
+
+
+def build(session: Session) -> None:
+    """Build the tab."""
+    Results(session)
+
+
+class Results:
+    """State, pictures and panel of the tab."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.state = session, session.state
+        self.data: dict[str, xr.Dataset] = {}
+        self.grids: dict[tuple[str, str], pv.ImageData] = {}
+        self.pictures = (look.Picture.empty(), look.Picture.empty())
+        self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
+        self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
+        self.state.update(
+            {
+                "r_moment": "0", "r_moments": [], "r_numbers": 0, "r_step": 0, "r_colour": "speed", "r_fields": [],
+                "r_colours": "viridis", "r_own": True, "r_low": 0.0, "r_high": 1.0, "r_on_x": False, "r_on_y": False,
+                "r_on_z": True, "r_x": 0.0, "r_y": 0.0, "r_z": 0.0, "r_box": [[0, 1, 0.1]] * 3, "r_surface": "",
+                "r_surfaces": [], "r_level": 0.0, "r_ends": [0.0, 1.0, 0.01], "r_opacity": 0.6, "r_arrows": False,
+                "r_every": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
+                "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
+                "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
+                "r_script": "", "r_script_shown": False, "r_moments_ms": 0,
+            }
+        )  # fmt: skip
+        watched = """
+            moment colour colours own low high on_x on_y on_z x y z surface level opacity arrows every length replaced
+            hide limited uncertainty lines particles tracks other chart_kind
+        """
+        self.state.change("theme", *(f"r_{name}" for name in watched.split()))(lambda **_: self.request())
+        self.state.change("r_step")(self._step_to)
+        self.state.change("r_surface")(lambda **_: self._range_of_level())
+        self.state.change("r_playing")(lambda r_playing, **_: r_playing and session.start(self._play()))
+        server = session.server
+        server.trigger("r_png")(self.png)
+        server.trigger("r_film")(self.film)
+        server.trigger("r_vti")(self.vti)
+        server.trigger("r_csv")(self.csv)
+        session.listeners.append(self._opened)
+        self._panel()
+
+    # -- data ---------------------------------------------------------------------------------------------------------
+
+    def _opened(self, what: str) -> None:
+        """Open other results."""
+        if what != "results":
+            return
+        self.data.clear()
+        self.grids.clear()
+        self.charted = ()
+        places = self.session.places
+        folders = [str(path) for path in places.results()]
+        self.state.r_others = [{"title": "nothing", "value": ""}] + [
+            {"title": places.name(Path(path)), "value": path} for path in folders
+        ]
+        if self.session.results is None:
+            return
+        numbers = self.numbers(str(self.session.results))
+        statistics = [("mean", "mean of all"), ("fluctuations", "rms and stresses")] if len(numbers) > 1 else []
+        noun = "instant" if "instant" in self.open(str(self.session.results)).dims else "pair"
+        titles = [(str(number), f"{noun} {number}") for number in numbers]
+        self.state.r_moments = [{"title": title, "value": value} for value, title in titles + statistics]
+        self.state.r_numbers, self.state.r_step = len(numbers), 0
+        self.state.r_moment = str(numbers[0])
+        folder = self.session.results
+        self.state.r_has = [
+            *(["particles"] if (folder / "particles").is_dir() else []),
+            *(["tracks"] if (folder / "tracks.nc").is_file() else []),
+        ]
+        self._first_look()
+        self.request()
+
+    def open(self, folder: str) -> xr.Dataset:
+        """Return the vectors of a folder, which lies in those given."""
+        if folder not in self.data:
+            self.data[folder] = lfpiv.open_results(self.session.places.within(folder))
+        return self.data[folder]
+
+    def numbers(self, folder: str) -> list[int]:
+        """Return the numbers of the pairs or instants of a folder."""
+        results = self.open(folder)
+        return [int(number) for number in results["instant" if "instant" in results.dims else "pair"].values]
+
+    def grid(self, folder: str, moment: str) -> pv.ImageData:
+        """Return the fields of a moment as a grid; the last ones are kept."""
+        key = (folder, moment)
+        if key not in self.grids:
+            while len(self.grids) > 40:
+                self.grids.pop(next(iter(self.grids)))
+            self.grids[key] = layers.grid_of(layers.field_at(self.open(folder), moment))
+        return self.grids[key]
+
+    def clouds(self, folder: str, moment: str) -> dict[str, pv.PolyData]:
+        """Return particles and tracks that are asked for."""
+        found, number = {}, int(moment) if moment.isdigit() else None
+        if self.state.r_particles and number is not None:
+            table = lfpiv.open_particles(folder, pairs=(number, number + 1))
+            found["particles"] = layers.points_of(table, ("x", "y", "z"))
+        if self.state.r_tracks:
+            found["tracks"] = layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
+        return found
+
+    def _first_look(self) -> None:
+        """Choose places, levels and lists that suit the fields."""
+        state, grid = self.state, self.grid(str(self.session.results), self.state.r_moment)
+        bounds = np.reshape(grid.bounds, (3, 2))
+        state.r_box = [[float(low), float(high), float((high - low) / 200) or 0.1] for low, high in bounds]
+        state.r_x, state.r_y, state.r_z = (float(value) for value in grid.center)
+        names = [name for name in (*LABELS, *grid.array_names) if name in grid.array_names and name != "velocity"]
+        state.r_fields = [{"title": label(name), "value": name} for name in dict.fromkeys(names)]
+        some = [name for name in SURFACES if name in grid.array_names]
+        state.r_surfaces = [{"title": "none", "value": ""}, *({"title": label(name), "value": name} for name in some)]
+        state.r_every = max(1, round(max(grid.dimensions) / 16))
+        state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
+        self._range_of_level()
+
+    def _range_of_level(self) -> None:
+        """Let the slider of the level run over the values of the field; start at 60 % of the way."""
+        name, folder = self.state.r_surface, self.session.results
+        if not name or folder is None:
+            return
+        values = self.grid(str(folder), self.state.r_moment)[name]
+        values = values[np.isfinite(values)]
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+        self.state.r_ends = [low, high, (high - low) / 200 or 1.0]
+        self.state.r_level = low + 0.6 * (high - low)
+
+    # -- pictures -----------------------------------------------------------------------------------------------------
+
+    @property
+    def look(self) -> look.Look:
+        """What the state asks for."""
+        s = self.state
+        return look.Look(
+            moment=str(s.r_moment), colour=s.r_colour, colours=s.r_colours,
+            limits=None if s.r_own else (float(s.r_low), max(float(s.r_high), float(s.r_low) + 1e-9)),
+            slices=tuple(float(s[f"r_{a}"]) if s[f"r_on_{a}"] else None for a in "xyz"),  # type: ignore[arg-type]
+            surface=s.r_surface or None, level=float(s.r_level), opacity=float(s.r_opacity),
+            arrows=int(s.r_every) if s.r_arrows else 0, length=float(s.r_length), replaced=bool(s.r_replaced),
+            hide_replaced=bool(s.r_hide), uncertainty=float(s.r_uncertainty) if s.r_limited else None,
+            lines=int(s.r_lines), particles=bool(s.r_particles), tracks=bool(s.r_tracks), theme=s.theme,
+        )  # fmt: skip
+
+    def request(self) -> None:
+        """Draw soon. Requests that come meanwhile are answered by the same picture."""
+        if self.pending:
+            return
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:  # before the server runs
+            self.session.guarded(self.draw)()
+            return
+        self.pending = True
+        loop.call_soon(self._draw_requested)
+
+    def _draw_requested(self) -> None:
+        self.pending = False
+        with self.state:
+            self.session.guarded(self.draw)()
+
+    def draw(self) -> None:
+        """Draw what the state asks for, in both pictures if two runs are compared."""
+        if self.session.results is None:
+            return
+        wanted, folders = self.look, [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
+        for folder, picture, view in zip(folders, self.pictures, self.views, strict=False):
+            grid = self.grid(folder, wanted.moment)
+            if wanted.colour not in grid.array_names:
+                raise InputError(f"{label(wanted.colour)}: {folder} has no such field. Choose another colour.")
+            picture.show(grid, wanted, self.clouds(folder, wanted.moment), title_of(wanted.colour))
+            view.update()
+        low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
+        if self.state.r_own:
+            self.state.r_low, self.state.r_high = float(f"{low:.4g}"), float(f"{high:.4g}")
+        self._chart(wanted, folders)
+
+    def _chart(self, wanted: look.Look, folders: list[str]) -> None:
+        """Draw the histogram of the colour's field, or profiles along the axes through the planes' places."""
+        kind, lines = self.state.r_chart_kind, {}
+        place = () if kind == "histogram" else (self.state.r_x, self.state.r_y, self.state.r_z)
+        key = (kind, place, wanted.moment, wanted.colour, wanted.hide_replaced, wanted.uncertainty, *folders)
+        if key == self.charted:
+            return
+        self.charted = key
+        for folder, picture in zip(folders, self.pictures, strict=False):
+            grid = picture.drawn["trusted"]
+            values = grid[wanted.colour]
+            if kind == "histogram":
+                lines[Path(folder).name] = charts.histogram(values)
+            else:
+                block = values.reshape(grid.dimensions[::-1])
+                index = [
+                    int(np.clip(round((self.state[f"r_{axis}"] - low) / step), 0, n - 1))
+                    for axis, low, step, n in zip("xyz", grid.origin, grid.spacing, grid.dimensions, strict=True)
+                ]
+                number = "xyz".index(kind)
+                places = [index[2], index[1], index[0]]
+                places[2 - number] = slice(None)  # type: ignore[call-overload]
+                along = grid.origin[number] + grid.spacing[number] * np.arange(grid.dimensions[number])
+                lines[Path(folder).name] = (along, block[tuple(places)])
+        if kind == "histogram":
+            self.state.r_chart = charts.chart(lines, title_of(wanted.colour), "number of vectors")
+        else:
+            self.state.r_chart = charts.chart(lines, f"{kind} [mm]", title_of(wanted.colour))
+
+    def _step_to(self, r_step: int, **_: Any) -> None:
+        if self.session.results is not None and self.state.r_numbers:
+            self.state.r_moment = self.state.r_moments[int(r_step)]["value"]
+
+    async def _play(self) -> None:
+        """Show one moment after the other until it is stopped."""
+        while self.state.r_playing:
+            with self.state:
+                self.state.r_step = (int(self.state.r_step) + 1) % max(1, self.state.r_numbers)
+            await asyncio.sleep(1 / FRAMES_PER_S)
+
+    def look_along(self, name: str) -> None:
+        """Turn the camera to a view by its name, or by steps."""
+        plotter = self.pictures[0].plotter
+        camera = plotter.camera
+        if name in ("left", "right", "up", "down"):
+            angle = {"left": -15.0, "right": 15.0, "up": 15.0, "down": -15.0}[name]
+            camera.Azimuth(angle) if name in ("left", "right") else camera.Elevation(angle)
+            camera.OrthogonalizeViewUp()
+        elif name in ("closer", "farther"):
+            camera.zoom(1.2 if name == "closer" else 1 / 1.2)
+        else:
+            plotter.camera_position = "xy" if VIEWS[name] == "oblique" else VIEWS[name]
+            if name == "oblique":
+                camera.azimuth, camera.elevation = 25.0, 20.0
+            plotter.reset_camera(bounds=self.grid(str(self.session.results), self.look.moment).bounds, render=False)
+            camera.zoom(0.85)
+        for picture, view in zip(self.pictures, self.views, strict=True):
+            picture.plotter.renderer.ResetCameraClippingRange()
+            view.update()
+
+    # -- what leaves the studio ---------------------------------------------------------------------------------------
+
+    def png(self) -> Any:
+        """Return the picture as PNG, side by side where two runs are compared."""
+        images = [picture.image() for picture in self.pictures[: 2 if self.state.r_other else 1]]
+        rows = min(image.shape[0] for image in images)
+        return self._attached(encoded(np.hstack([image[:rows] for image in images])))
+
+    async def film(self, kind: str) -> Any:
+        """Return a film of the series, or of one turn, as MP4."""
+        import imageio_ffmpeg
+
+        plotter, start = self.pictures[0].plotter, self.state.r_step
+        count = 60 if kind == "turn" else self.state.r_numbers
+        with tempfile.TemporaryDirectory() as folder:
+            path, writer = Path(folder) / "film.mp4", None
+            for number in range(count):
+                if kind == "turn":
+                    plotter.camera.Azimuth(360 / count)
+                else:
+                    self.state.r_moment = self.state.r_moments[number]["value"]
+                    self.draw()
+                image = self.pictures[0].image()
+                image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
+                if writer is None:
+                    fps = 20 if kind == "turn" else FRAMES_PER_S
+                    writer = imageio_ffmpeg.write_frames(
+                        str(path), image.shape[1::-1], fps=fps, macro_block_size=2, quality=8
+                    )
+                    writer.send(None)
+                    size = image.shape
+                if image.shape == size:
+                    writer.send(image)
+                await asyncio.sleep(0)
+            if writer is not None:
+                writer.close()
+            content = path.read_bytes()
+        self._step_to(start)
+        return self._attached(content)
+
+    def vti(self) -> Any:
+        """Return the fields of the moment as VTK image data."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "field.vti"
+            self.grid(str(self.session.results), self.look.moment).save(path)
+            return self._attached(path.read_bytes())
+
+    def csv(self) -> Any:
+        """Return the vectors of the moment as a table, a row each."""
+        grid = self.grid(str(self.session.results), self.look.moment)
+        names = [name for name in grid.array_names if name != "velocity"]
+        text = io.StringIO()
+        writer = csv.writer(text)
+        units = [LABELS.get(name, ("", ""))[1] for name in names]
+        named = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
+        writer.writerow(["x [mm]", "y [mm]", "z [mm]", *named])
+        table = np.column_stack([grid.points, *(grid[name] for name in names)])
+        writer.writerows([[f"{value:.9g}" for value in row] for row in table])
+        return self._attached(text.getvalue().encode())
+
+    def copy(self) -> None:
+        """Show the script that draws what is seen."""
+        plotter = self.pictures[0].plotter
+        camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
+        self.state.r_script = look.script(
+            self.look, str(self.session.results), title_of(self.state.r_colour), camera, tuple(plotter.window_size)
+        )
+        self.state.r_script_shown = True
+
+    def _attached(self, content: bytes) -> Any:
+        return self.session.server.protocol.addAttachment(content)
+
+    # -- page ---------------------------------------------------------------------------------------------------------
+
+    def _panel(self) -> None:
+        with html.Div(classes="lf-split"):
+            with html.Div(classes="lf-panel"):
+                self._moment_controls()
+                self._layer_controls()
+                self._chart_controls()
+                self._out_controls()
+            with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
+                self.views = (self._view(0, "results_name", "true"), self._view(1, "r_other", "!!r_other"))
+        with v3.VDialog(v_model=("r_script_shown",), max_width=900):
+            with v3.VCard(title="This picture as Python", classes="pa-3"):
+                html.Textarea(
+                    v_model=("r_script",), readonly=True, rows=18, id="r-script", aria_label="script",
+                    style="width:100%;font-family:monospace;font-size:12px",
+                )  # fmt: skip
+                with html.Div(classes="lf-buttons"):
+                    controls.button("Copy", "window.navigator.clipboard.writeText(r_script)", "mdi-content-copy")
+                    controls.button("Close", "r_script_shown = false")
+
+    def _view(self, number: int, name: str, shown: str) -> Any:
+        with html.Div(classes="lf-view", v_show=shown):
+            html.Div(f"{{{{ {name} }}}}", classes="lf-name")
+            return vtk_widgets.VtkRemoteView(
+                self.pictures[number].plotter.render_window, ref=f"results_{number}", interactive_ratio=0.7,
+                interactive_quality=70, still_quality=95,
+                interactor_events=("r_events", ["EndAnimation", "Animation"]),
+                EndAnimation=self._linked, Animation=self._linked,
+            )  # fmt: skip
+
+    def _linked(self, *_: Any, **__: Any) -> None:
+        """Show the same camera in both pictures."""
+        if self.state.r_other:
+            for view in self.views:
+                view.update()
+
+    def _moment_controls(self) -> None:
+        controls.choice("r_moment", "shown", ("r_moments",), id="r-moment")
+        with html.Div(v_if="r_numbers > 1"):
+            controls.slider("r_step", "through the series", 0, ("r_numbers - 1",), 1)
+            controls.button("{{ r_playing ? 'Stop' : 'Play' }}", "r_playing = !r_playing", id="r-play")
+        controls.choice("r_colour", "colour", ("r_fields",), id="r-colour")
+        controls.choice("r_colours", "colour map", (list(COLOURS),))
+        controls.switch("r_own", "colours over the field's own range")
+        with html.Div(v_if="!r_own"):
+            controls.slider(
+                "r_low", "lowest", ("Math.min(r_low, -Math.abs(r_high))",), ("r_high",), ("Math.abs(r_high) / 100",)
+            )
+            controls.slider(
+                "r_high", "highest", ("r_low",), ("2 * Math.abs(r_high) || 1",), ("Math.abs(r_high) / 100 || 0.01",)
+            )
+
+    def _layer_controls(self) -> None:
+        html.H3("Planes")
+        for number, axis in enumerate("xyz"):
+            controls.switch(f"r_on_{axis}", f"plane normal to {axis}", id=f"r-on-{axis}")
+            low, high, step = (f"r_box[{number}][{part}]" for part in range(3))
+            controls.slider(f"r_{axis}", axis, (low,), (high,), (step,), unit="mm", v_if=f"r_on_{axis}")
+        html.H3("Isosurface")
+        controls.choice("r_surface", "field", ("r_surfaces",), id="r-surface")
+        with html.Div(v_if="r_surface"):
+            controls.slider("r_level", "level", ("r_ends[0]",), ("r_ends[1]",), ("r_ends[2]",))
+            controls.slider("r_opacity", "opacity", 0.1, 1, 0.05)
+        html.H3("Arrows and streamlines")
+        controls.switch("r_arrows", "arrows", id="r-arrows")
+        with html.Div(v_if="r_arrows"):
+            controls.slider("r_every", "on every n-th vector", 1, 10, 1)
+            controls.slider("r_length", "length", 0.2, 6, 0.1)
+        controls.slider("r_lines", "streamlines", 0, 300, 5)
+        with html.Div(v_if="r_has.includes('particles')"):
+            controls.switch("r_particles", "particles")
+        with html.Div(v_if="r_has.includes('tracks')"):
+            controls.switch("r_tracks", "tracks")
+        html.H3("Trust")
+        controls.switch("r_hide", "leave out replaced vectors")
+        controls.switch("r_replaced", "show replaced vectors in grey")
+        controls.switch("r_limited", "leave out uncertain vectors")
+        controls.slider("r_uncertainty", "largest uncertainty", 0, 2, 0.02, unit="voxel", v_if="r_limited")
+
+    def _chart_controls(self) -> None:
+        html.H3("Chart")
+        kinds = [
+            {"title": "histogram", "value": "histogram"},
+            *({"title": f"profile along {a}", "value": a} for a in "xyz"),
+        ]
+        controls.choice("r_chart_kind", "chart", (kinds,))
+        html.Div(v_html=("r_chart",))
+
+    def _out_controls(self) -> None:
+        html.H3("View")
+        with html.Div(classes="lf-buttons"):
+            for name in VIEWS:
+                controls.button(name, (self.look_along, f"['{name}']"))
+            for name, icon in (
+                ("left", "⟲"),
+                ("right", "⟳"),
+                ("up", "↑"),
+                ("down", "↓"),
+                ("closer", "+"),
+                ("farther", "−"),
+            ):
+                controls.button(icon, (self.look_along, f"['{name}']"), title=f"turn {name}", id=f"r-turn-{name}")
+        controls.choice("r_other", "side by side with", ("r_others",), id="r-other")
+        html.H3("Take along")
+        with html.Div(classes="lf-buttons"):
+            controls.button("PNG", "utils.download('lfpiv.png', trigger('r_png'), 'image/png')")
+            controls.button("Film of a turn", "utils.download('turn.mp4', trigger('r_film', ['turn']), 'video/mp4')")
+            film = "utils.download('series.mp4', trigger('r_film', ['series']), 'video/mp4')"
+            controls.button("Film of the series", film, v_if="r_numbers > 1")
+            controls.button("VTI", "utils.download('field.vti', trigger('r_vti'), 'application/xml')")
+            controls.button("CSV", "utils.download('field.csv', trigger('r_csv'), 'text/csv')")
+            controls.button("Copy as Python", self.copy, "mdi-language-python", id="r-copy")
+
+
+def label(name: str) -> str:
+    """Return what people call a field."""
+    return LABELS.get(name, (name.replace("_", " "), ""))[0]
+
+
+def title_of(name: str) -> str:
+    """Return what people call a field, with its unit."""
+    text, unit = LABELS.get(name, (name.replace("_", " "), ""))
+    return f"{text} [{unit}]" if unit else text
+
+
+def encoded(image: np.ndarray) -> bytes:
+    """Return a picture as PNG."""
+    import cv2
+
+    return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1])

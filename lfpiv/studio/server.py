@@ -1,0 +1,107 @@
+"""Start the studio: a server of this machine only, with a token in its address, and its page in the browser."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import logging
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lfpiv.errors import InputError
+
+log = logging.getLogger(__name__)
+
+NEEDED = ("trame", "trame_vtk", "trame_vuetify", "pyvista", "tomlkit", "imageio_ffmpeg")
+"""Packages of the extra `studio`."""
+
+
+def require_extra() -> None:
+    """Raise InputError where packages of the extra `studio` are missing."""
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        named = ", ".join(name.replace("_", "-") for name in missing)
+        raise InputError(
+            f"lfpiv studio: expected the packages of the extra `studio`, found no {named}. "
+            "Install them: pip install 'lfpiv[studio]'"
+        )
+
+
+def quiet_vtk() -> None:
+    """Let VTK log errors only. It warns where it finds no screen, and then draws without."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+
+
+def serve(
+    path: str | Path | None = None,
+    *,
+    port: int = 0,
+    browser: bool = True,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the studio until it is interrupted or closed.
+
+    Parameters
+    ----------
+    path : path, optional
+        Experiment file, results of a run, or a folder with either; default: the present folder.
+    port : int
+        Port of 127.0.0.1; 0 for a free one.
+    browser : bool
+        Open the page in the browser.
+    ready : callable, optional
+        Called with the address, token included, when the page can be opened.
+
+    Raises
+    ------
+    InputError
+        If packages of the extra are missing, or there is nothing at `path`.
+    """
+    require_extra()
+    from lfpiv.studio import access, page
+
+    given = Path.cwd() if path is None else Path(path)
+    if not given.exists():
+        raise InputError(f"{given}: expected an experiment file or the results of a run, found nothing there.")
+    quiet_vtk()
+    token = access.Token()
+    session = page.build(given.resolve())
+    server = session.server
+
+    def bind(bound: Any) -> None:
+        bound.app.middlewares.append(token.middleware())
+        bound.app.add_routes(page.routes(session))
+
+    def started(**_: Any) -> None:
+        address = f"http://127.0.0.1:{server.port}/index.html?token={token.word}"
+        if ready is not None:
+            ready(address)
+        if browser:
+            webbrowser.open(address)
+
+    server.controller.on_server_bind.add(bind)
+    server.controller.on_server_ready.add(started)
+    arguments, sys.argv = sys.argv, sys.argv[:1]  # trame reads them
+    try:
+        asyncio.run(_run(server, port))
+    except OSError as error:
+        raise InputError(f"port {port}: {(error.strerror or str(error)).lower()}. Choose another --port.") from None
+    finally:
+        sys.argv = arguments
+
+
+async def _run(server: Any, port: int) -> None:
+    await server.start(
+        port=port,
+        host="127.0.0.1",
+        exec_mode="coroutine",
+        open_browser=False,
+        show_connection_info=False,
+        disable_logging=True,
+        timeout=0,
+    )

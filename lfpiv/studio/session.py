@@ -1,0 +1,80 @@
+"""What the studio has open: folders, experiment file, results, and what its tabs share."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lfpiv.errors import InputError
+from lfpiv.studio.access import Places
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Session:
+    """An open studio: the server of the page, and the files that its tabs look at."""
+
+    server: Any
+    places: Places
+    experiment: Path | None = None
+    """The experiment file."""
+    results: Path | None = None
+    """Folder of a run, or a store."""
+    listeners: list[Callable[[str], None]] = field(default_factory=list)
+    """Called with "experiment" or "results" when another one is opened or it changed."""
+    tasks: set[asyncio.Task[Any]] = field(default_factory=set)
+
+    @property
+    def state(self) -> Any:
+        """The state that page and server share."""
+        return self.server.state
+
+    def changed(self, what: str) -> None:
+        """Tell all tabs that the experiment or the results changed."""
+        self.state.experiment_name = self.places.name(self.experiment) if self.experiment else ""
+        self.state.results_name = self.places.name(self.results) if self.results else ""
+        for listener in self.listeners:
+            self.guarded(listener)(what)
+
+    def guarded(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function whose errors are shown on the page."""
+
+        def call(*given: Any, **named: Any) -> Any:
+            try:
+                return function(*given, **named)
+            except Exception as error:
+                self.tell(error)
+                return None
+
+        return call
+
+    def tell(self, error: BaseException | str) -> None:
+        """Show an error or a message on the page. Unexpected errors are logged with their trace."""
+        expected = isinstance(error, str | InputError | OSError | ValueError)
+        if not expected:
+            log.error("studio", exc_info=error)  # type: ignore[arg-type]
+        self.state.message = str(error) if expected else f"unexpected {type(error).__name__}: {error}"
+        self.state.message_shown = True
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Do work beside the page, which stays alive; its errors are shown there."""
+
+        async def watched() -> None:
+            try:
+                await work
+            except Exception as error:
+                with self.state:
+                    self.tell(error)
+
+        task = asyncio.get_running_loop().create_task(watched())
+        self.tasks.add(task)
+        task.add_done_callback(self.tasks.discard)
+
+    async def aside(self, function: Callable[..., Any], *given: Any) -> Any:
+        """Compute in another thread and return the result."""
+        return await asyncio.get_running_loop().run_in_executor(None, function, *given)

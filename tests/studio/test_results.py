@@ -1,0 +1,72 @@
+"""Results on the page: a first picture, planes, surfaces, and the script that draws what is seen."""
+
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from support.report_run import field
+from support.studio_page import served, until
+
+from lfpiv.results import netcdf
+
+SAME_PICTURE = 1.0
+"""Largest mean difference of pictures by the same calls [grey level]: fonts may be a pixel apart."""
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio") / "run <b>"
+    for pair in range(2):
+        netcdf.write_vectors(field(pair), folder / "vectors" / f"pair_{pair:04d}.nc", attributes={"pair": pair})
+    return folder
+
+
+def test_a_surface_has_its_level_and_a_plane_its_place(results):
+    import lfpiv
+    from lfpiv.studio import layers
+
+    grid = layers.grid_of(layers.field_at(lfpiv.open_results(results), "0"))
+    surface = layers.surface(grid, "u", 0.0, "u")
+    assert surface.n_points and np.allclose(surface["u"], 0.0, atol=1e-6)
+    plane = layers.slice_at(grid, "y", 0.1)
+    assert np.allclose(np.asarray(plane.points)[:, 1], 0.1)
+    hidden = layers.trusted(grid, True, None)
+    assert np.array_equal(np.isnan(hidden["u"]), grid["valid"] < 0.5) and hidden["valid"].min() == 0
+
+
+def test_the_script_draws_what_is_seen(results, tmp_path):
+    import cv2
+
+    import lfpiv
+    from lfpiv.studio import layers, look
+
+    seen = look.Look(surface="u", level=0.001, arrows=1, slices=(0.1, None, 0.0), lines=10, colour="v", theme="dark")
+    picture = look.Picture.empty((400, 300))
+    picture.show(layers.grid_of(layers.field_at(lfpiv.open_results(results), "0")), seen, {}, "v [m/s]")
+    image = picture.image()
+    camera = [tuple(map(float, vector)) for vector in picture.plotter.camera_position]
+    (tmp_path / "script.py").write_text(look.script(seen, str(results), "v [m/s]", camera, (400, 300)), "utf-8")
+    subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True, capture_output=True)
+    again = cv2.imread(str(tmp_path / "picture.png"))[..., ::-1]
+    assert image.std() > 10 and np.abs(again.astype(int) - image[..., :3]).mean() < SAME_PICTURE
+
+
+@pytest.mark.browser
+def test_the_page_shows_and_turns_results(results, browser):
+    with served(results) as address:
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(address.partition("?")[0])
+        browser.get(address)
+        shown = "const i = document.querySelector('.lf-view img'); return i && i.naturalWidth > 50 ? i.src : ''"
+        first = until(lambda: browser.execute_script(shown))
+        assert browser.find_element("class name", "lf-name").text == "run <b>"
+        browser.find_element("id", "r-on-x").send_keys(" ")
+        second = until(lambda: (now := browser.execute_script(shown)) != first and now)
+        browser.find_element("id", "r-turn-left").click()
+        until(lambda: browser.execute_script(shown) != second)
+        browser.find_element("id", "r-copy").click()
+        script = until(lambda: browser.find_element("id", "r-script").get_property("value"))
+        assert "slices=(" in script and "camera_position" in script
