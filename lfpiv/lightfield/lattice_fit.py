@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.lattice_stretch import LatticeStretch, fit_stretch
 
 LARGEST_SHIFT = 0.05
 """Shift of an image's light from the microimages up to which both agree [microlens pitch]."""
@@ -80,7 +81,14 @@ class _Folding:
     """Sum of it for each lens, 0 for a lens that is not seen as a whole."""
     basis: np.ndarray
     """Lattice vectors on the sensor, rows (column, row) [pixel]."""
+    places: np.ndarray
+    """Place of each pixel, relative to the sensor's centre, rows (column, row) [half diagonal]."""
+    half_diagonal: float
+    """Half of the sensor's diagonal [pixel]."""
 
+
+Cells = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Folds of the image and of the white image, and the number of pixels, each (tile, bins, bins)."""
 
 _foldings: WeakKeyDictionary[LightFieldDecoder, _Folding] = WeakKeyDictionary()
 
@@ -100,12 +108,13 @@ def fit_lattice(light: np.ndarray, decoder: LightFieldDecoder) -> LatticeFit | N
     LatticeFit or None
         None where too few lenses are lit.
     """
-    if decoder not in _foldings:
-        _foldings[decoder] = _folding(decoder)
-    folding = _foldings[decoder]
-    cells = _fold(light, folding)
-    if len(cells[0]) < _FEWEST_TILES:
-        return None
+    folding = _folding_of(decoder)
+    cells, _ = _fold(light, folding)
+    return _fit(cells, folding, decoder) if len(cells[0]) >= _FEWEST_TILES else None
+
+
+def _fit(cells: Cells, folding: _Folding, decoder: LightFieldDecoder) -> LatticeFit:
+    """Measure the shift between the folds of an image and of the white image."""
     correlation = _correlate(*cells)
     shift, likeness = _highest(correlation)
     vectors = folding.basis / decoder.optics.microimage_pitch_px
@@ -151,8 +160,14 @@ def disagreement(
         ``fit``, a clause; ``shift_px`` and ``shift_pitch``, if the image fits when it is shifted.
     """
     others = others or {}
-    found = fit_lattice(light, decoder)
-    if found is None or not (found.shifted or misplaced):
+    folding = _folding_of(decoder)
+    cells, centres = _fold(light, folding)
+    if len(cells[0]) < _FEWEST_TILES:
+        return None
+    found = _fit(cells, folding, decoder)
+    alike = found.shifted or found.unshifted > 1 - _GAIN
+    stretch = None if alike else _stretch(cells, centres, folding)
+    if not (found.shifted or stretch or misplaced):
         return None
     hypotheses = [
         *((f"{how} it fits", turned, decoder) for how, turned in _turned(light)),
@@ -163,6 +178,8 @@ def disagreement(
         fit = fit_lattice(image, lattice) if image.shape == lattice.gain.shape else None
         if fit is not None and not fit.shifted and fit.unshifted > LEAST_LIKENESS:
             likeness[what] = fit.unshifted
+    if stretch is not None:
+        likeness[stretch.sentence] = stretch.likeness
     best = max([found.likeness, *likeness.values()])
     fits = [what for what, value in likeness.items() if value > best - _ALIKE]
     if found.likeness > LEAST_LIKENESS:
@@ -171,6 +188,13 @@ def disagreement(
         return None
     shift = {"shift_px": float(np.hypot(*found.shift_px)), "shift_pitch": found.shift_pitch}
     return (shift if found.likeness > LEAST_LIKENESS else {}) | {"fit": ", ".join(fits)}
+
+
+def _stretch(cells: Cells, centres: np.ndarray, folding: _Folding) -> LatticeStretch | None:
+    """Return the turn and the change of pitch that make the image's microimages those of the white image."""
+    stretch = fit_stretch(*cells, centres, folding.basis, folding.half_diagonal)
+    explained = stretch is not None and stretch.likeness > LEAST_LIKENESS
+    return stretch if explained and stretch.gain > max(_GAIN, 1 - stretch.likeness) else None
 
 
 def _turned(light: np.ndarray) -> list[tuple[str, np.ndarray]]:
@@ -190,6 +214,13 @@ def _turned(light: np.ndarray) -> list[tuple[str, np.ndarray]]:
     return ways
 
 
+def _folding_of(decoder: LightFieldDecoder) -> _Folding:
+    """Return the tiles of a decoder, chosen at its first use."""
+    if decoder not in _foldings:
+        _foldings[decoder] = _folding(decoder)
+    return _foldings[decoder]
+
+
 def _folding(decoder: LightFieldDecoder) -> _Folding:
     """Choose tiles of lenses, evenly spread over the sensor, and find lens and bin of their pixels."""
     index = decoder.lens_index - decoder.lens_index.min((0, 1))
@@ -205,26 +236,39 @@ def _folding(decoder: LightFieldDecoder) -> _Folding:
     place = (np.floor(offset % 1 * _BINS).astype(np.int64) % _BINS) @ [_BINS, 1]
     lens = index @ [count, 1]
     white = (decoder.gain * decoder.coverage).ravel()[pixels]
+    tile_of, tiles = tile @ [across, 1], int((tile @ [across, 1]).max()) + 1
     total = np.bincount(lens, white)
     whole = total > _WHOLE_LENS * np.median(total[total > 0])
     return _Folding(
         pixels=pixels,
         lens=lens,
-        bins=(tile @ [across, 1]) * _BINS**2 + place,
-        tiles=int((tile @ [across, 1]).max()) + 1,
+        bins=tile_of * _BINS**2 + place,
+        tiles=tiles,
         white=white,
         white_light=np.where(whole, total, 0),
         basis=basis / decoder.optics.pixel_mm,
+        places=_places(pixels, decoder.gain.shape),
+        half_diagonal=float(np.hypot(*decoder.gain.shape)) / 2,
     )
 
 
-def _fold(light: np.ndarray, folding: _Folding) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _places(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the places of pixels, relative to the sensor's centre, over its half diagonal, shape (2, pixels)."""
+    rows, columns = np.divmod(pixels, shape[1])
+    middle = (np.array([[shape[1]], [shape[0]]]) - 1) / 2
+    places: np.ndarray = (np.stack([columns, rows]) - middle) / (np.hypot(*shape) / 2)
+    return places
+
+
+def _fold(light: np.ndarray, folding: _Folding) -> tuple[Cells, np.ndarray]:
     """Fold an image, and the white image with lenses as bright, onto the cell of each tile that is lit.
 
     Returns
     -------
-    image, white, pixels : ndarray, shape (tile, bins, bins)
-        Sums of light [counts], and the number of pixels.
+    cells : (ndarray, ndarray, ndarray), each of shape (tile, bins, bins)
+        Sums of light of the image and the white image [counts], and the number of pixels.
+    centres : ndarray, shape (tile, 2)
+        Centre of each tile's light, relative to the sensor's centre, as (column, row) [half diagonal].
     """
     light = light.ravel()[folding.pixels]
     clip = float(np.percentile(light, _CLIP_PERCENTILE))
@@ -236,7 +280,9 @@ def _fold(light: np.ndarray, folding: _Folding) -> tuple[np.ndarray, np.ndarray,
     parts = light[lit], (folding.white * level)[lit], None
     image, white, pixels = (np.bincount(bins, part, size).reshape(-1, _BINS, _BINS) for part in parts)
     kept = white.sum(axis=(1, 2)) > 0
-    return image[kept], white[kept], pixels[kept]
+    tile, bright = bins // _BINS**2, parts[1]
+    moments = np.stack([np.bincount(tile, bright * place[lit], folding.tiles)[kept] for place in folding.places], -1)
+    return (image[kept], white[kept], pixels[kept]), moments / white[kept].sum(axis=(1, 2))[:, None]
 
 
 def _correlate(image: np.ndarray, white: np.ndarray, pixels: np.ndarray) -> np.ndarray:

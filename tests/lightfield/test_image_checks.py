@@ -5,6 +5,7 @@ import logging
 import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -26,6 +27,7 @@ QUARTER_PITCH_PX = 3  # of 12.5
 MIRRORED_PITCH = {"square": 0.4, "hexagonal": np.hypot(0.5, 0.6 - np.sqrt(0.75))}
 """Distance between the lattice of the second of `OFFSETS_MM` and its picture upside down [pitch]."""
 SHIFT_PX = 0.3  # four times the step at which shifts are read
+TURN_DEG, WIDENING = 0.25, 0.005  # 0.11 pitch at the corner: 60 particles light parts of the pupil
 OFFSETS_MM = ((0.0, 0.0), (0.05, 0.03))
 """Offsets of the arrays on their sensors: half a pitch and a third of a pitch apart."""
 
@@ -88,6 +90,25 @@ def test_the_lattice_of_the_particle_images_shows_what_is_misplaced(pair_of_came
         assert "white image of camera right" in lattice_fit.disagreement(light, left, {"right": right})["fit"]
     noise = rng.normal(0, 4, light.shape).astype(np.float32)
     assert lattice_fit.disagreement(noise, right, {"left": left}) is None
+
+
+@pytest.mark.parametrize(("turn_deg", "widening"), [(1.0, 0), (-1.5, 0), (0, 0.018), (0, -0.025), (0.8, 0.012)])
+def test_a_turned_or_refocused_array_is_told_by_its_turn_and_pitch(pair_of_cameras, turn_deg, widening):
+    experiment, calibration = pair_of_cameras
+    decoder = calibration.cameras["right"].decoder
+    image = experiment.particle_image("right", 0, "a").astype(np.float32)
+    rows, columns = image.shape
+    turn = np.radians(turn_deg)
+    matrix = (1 + widening) * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    middle = (np.array([columns, rows]) - 1) / 2
+    moved = cv2.warpAffine(
+        image, np.c_[matrix, middle - matrix @ middle], (columns, rows), borderMode=cv2.BORDER_REFLECT
+    )
+    assert lattice_fit.disagreement(image - np.float32(decoder.background(image)[0]), decoder) is None
+    fit = lattice_fit.disagreement(moved - np.float32(decoder.background(moved)[0]), decoder)["fit"]
+    told = re.search(r"turned by (\S+) degrees and (\S+)% (farther|closer)", fit)
+    assert abs(float(told[1]) - turn_deg) < TURN_DEG
+    assert abs(float(told[2]) / 100 * (1 if told[3] == "farther" else -1) - widening) < WIDENING
 
 
 def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
