@@ -61,8 +61,6 @@ class StackedFiles:
         self.folder = folder / "vectors"
         self.dimension, self.numbers, self.width = _listed(folder, pairs)
         first = netcdf.read_vectors(self.path(0))
-        self.stored_names = {str(name) for name in first.data_vars}
-        """Variables that the files hold. The others follow from them and the damping by ghosts."""
         try:
             depends_on = read_object(first.attrs.get("depends_on", "{}"))
         except RecordError as error:

@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
 from lfpiv.files import replacing, replacing_folder
 from lfpiv.progress import StepProgress
+from lfpiv.records import validate
 from lfpiv.results import datasets, netcdf, store_seal
 from lfpiv.results.folder import locked
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
@@ -45,14 +47,15 @@ LAYOUT = 1
 OLDEST_ZARR = 3
 """Oldest major version of zarr that writes and reads stores."""
 
-COMPLETE, SIGNATURE, CHANGED = "complete", "signature", "file_changed_ns"
-"""Attributes of a Zarr store, and its variable with the time of the last change of each vector file [ns]."""
+WRITTEN, SIGNATURE, CHANGED = "written", "signature", "file_changed_ns"
+"""Attributes of a Zarr store: number of pairs that are written, and what they share. Its variable with the time of the
+last change of each vector file [ns]."""
 
 
 def is_store(path: Path) -> bool:
     """Return whether a path is a NetCDF file or a Zarr store, and not the folder of a run."""
     if path.is_dir():
-        return path.suffix == ".zarr" or (path / ".zgroup").is_file() or (path / "zarr.json").is_file()
+        return path.suffix == ".zarr" or (path / store_seal.METADATA).is_file()
     return path.suffix == ".nc" and path.is_file()
 
 
@@ -79,7 +82,7 @@ def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Da
         text = " ".join((error.reason if isinstance(error, DamagedFile) else str(error)).split())[:300]
         raise InputError(f"{path}: expected a store of `lfpiv export`, found {text}. Export again.") from None
     dimension = INSTANT if INSTANT in results.dims else PAIR
-    for name in ("history", FORM, COMPLETE, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
+    for name in ("history", FORM, WRITTEN, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
         results.attrs.pop(name, None)
     if isinstance(edges := results.attrs.get("voxel_mm"), list):
         results.attrs["voxel_mm"] = np.asarray(edges)
@@ -93,16 +96,16 @@ def _verified(path: Path) -> xr.Dataset:
     chunks: dict[str, int] | None = None if importlib.util.find_spec("dask") is None else {}
     if path.is_dir():
         _require_zarr()
-        stated = store_seal.zarr_metadata(path)["metadata"][".zattrs"]
+        stated = store_seal.zarr_attributes(path)
         _require_form(stated, path)
-        if not stated.get(COMPLETE, 1):
+        if store_seal.CONTENT not in stated:
             raise InputError(
                 f"{path}: expected a complete store, found that of an export that was interrupted or goes on. The same "
                 "`lfpiv export` goes on from there."
             )
         store_seal.check_zarr(path)
         store_seal.verify_zarr(path)
-        results = xr.open_zarr(path, consolidated=True, chunks=chunks, zarr_format=2)
+        results = xr.open_zarr(path, consolidated=False, chunks=chunks, zarr_format=3)
     else:
         with hdf5.glanced(path) as file:
             _require_form(file.attrs, path)
@@ -170,11 +173,11 @@ def write_netcdf(
 def write_zarr(
     files: StackedFiles, path: Path, attributes: Mapping[str, Any], interval_s: float | None, progress: StepProgress
 ) -> None:
-    """Write a stack of vector files into a Zarr store of format 2, or add to the store what is new.
+    """Write a stack of vector files into a Zarr store of format 3, or add to the store what is new.
 
-    Pairs are written from the first one on that is new or whose file changed. The consolidated metadata name only what
-    is written completely, and say whether all is; so a store whose export was killed is not taken for complete, and the
-    next export goes on. A store of other settings is written anew.
+    Pairs are written from the first one on that is new or whose file changed. The attributes say how many are written
+    completely, and only a complete store has digests; so a store whose export was killed is not taken for complete, and
+    the next export goes on. A store of other settings is written anew.
 
     Parameters are those of `write_netcdf`.
 
@@ -198,39 +201,60 @@ def _write_zarr(
     pairs, tile = _layout(files)
     identity = json.dumps([files.signature, interval_s, pairs, tile])
     changed = files.changed_ns()
-    start = _kept(path, identity, files, changed, pairs)
-    own = {**attributes, FORM: LAYOUT, SIGNATURE: identity, COMPLETE: 0}
-    if start is None:
-        shutil.rmtree(path, ignore_errors=True)
-        start = 0
-    elif start == len(files) and _attributes_of(path).get(COMPLETE):
+    start, complete = _kept(path, identity, files, changed, pairs)
+    if start == len(files) and complete:
         log.info("%s: has all %d %ss", path, len(files), files.dimension)
         progress(1.0)
         return
-    else:
+    if start:
         log.info("%s: has %d of %d %ss, the others are added", path, start, len(files), files.dimension)
-        _resize(zarr, path, files.dimension, start, complete=0)
+        _shorten(path, files.dimension, start)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
     for first, after in _blocks(start, len(files), pairs):
         progress(first / len(files))
         block = _with_times(files.block(first, after), interval_s)
         block = block.assign_coords({CHANGED: (files.dimension, changed[first:after])})
-        if first == 0 and not (path / ".zgroup").exists():
-            _create(block, path, own, files.dimension, (pairs, *tile))
-        _resize(zarr, path, files.dimension, after, complete=0, block=block, first=first)
-    _resize(zarr, path, files.dimension, len(files), complete=1)
-    _seal(zarr, path)
+        packed = datasets.packed(block, {**attributes, FORM: LAYOUT, SIGNATURE: identity, WRITTEN: first})
+        packed.attrs = _listed(packed.attrs)
+        for variable in packed.variables.values():
+            variable.attrs, variable.encoding = _listed(variable.attrs), {}
+        if first == 0:
+            with replacing_folder(path) as scratch:
+                encoding = _encoding(packed, files.dimension, (pairs, *tile))
+                packed.to_zarr(scratch, mode="w", consolidated=False, encoding=encoding, zarr_format=3)
+        else:
+            packed.to_zarr(path, append_dim=files.dimension, consolidated=False, zarr_format=3)
+        _group(path).attrs[WRITTEN] = after
+    with warnings.catch_warnings():  # that consolidated metadata are not yet in the specification; xarray asks for them
+        warnings.simplefilter("ignore")
+        group = zarr.consolidate_metadata(str(path), zarr_format=3)
+        group.attrs.update(store_seal.zarr_digests(path))
     progress(1.0)
 
 
-def _seal(zarr: Any, path: Path) -> None:
-    """State the digests of a complete Zarr store in its metadata."""
-    _group(zarr, path).attrs.update(store_seal.zarr_digests(path))
-    zarr.consolidate_metadata(str(path), zarr_format=2)
+def _listed(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes as JSON has them."""
+    return {str(name): np.asarray(value).tolist() for name, value in attributes.items()}
 
 
-def _group(zarr: Any, path: Path) -> Any:
-    """Open a store to write, with the metadata of each array."""
-    return zarr.open_group(str(path), mode="r+", use_consolidated=False, zarr_format=2)
+def _group(path: Path) -> Any:
+    """Open a store to write."""
+    import zarr
+
+    return zarr.open_group(str(path), mode="r+", use_consolidated=False, zarr_format=3)
+
+
+def _shorten(path: Path, dimension: str, length: int) -> None:
+    """Take a store for unfinished, and cut its arrays off along the pairs."""
+    group = _group(path)
+    stated = {
+        name: value for name, value in group.attrs.items() if name not in (store_seal.OUTLINE, store_seal.CONTENT)
+    }
+    group.attrs.put({**stated, WRITTEN: length})
+    for _, array in group.arrays():
+        if dimension in array.metadata.dimension_names and array.shape[0] > length:
+            array.resize((length, *array.shape[1:]))
 
 
 def _layout(files: StackedFiles) -> tuple[int, tuple[int, ...]]:
@@ -280,41 +304,39 @@ def _require_zarr() -> None:
         )
 
 
-def _attributes_of(path: Path) -> dict[str, Any]:
-    """Return the attributes of a Zarr store as its consolidated metadata state them; empty without."""
-    try:
-        return dict(store_seal.zarr_metadata(path)["metadata"][".zattrs"])
-    except DamagedFile:
-        return {}
-
-
-def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray, length: int) -> int | None:
-    """Return how many of the files a store already has, from the first on; None if it must be written anew.
+def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray, length: int) -> tuple[int, bool]:
+    """Return how many of the files a store already has, from the first on, and whether it is complete.
 
     Blocks of an unfinished store have `length` pairs.
     """
     if not path.exists():
-        return None
-    own = _attributes_of(path) or _plain_attributes(path)
+        return 0, False
+    try:
+        own = store_seal.zarr_attributes(path)
+    except DamagedFile:
+        own = {}
     if FORM not in own and any(path.iterdir()):
         raise InputError(f"{path}: expected a place for a Zarr store, found another folder. Remove it, or use --out.")
     if own.get(FORM) != LAYOUT or own.get(SIGNATURE) != identity:
-        return None
-    complete = bool(own.get(COMPLETE))
+        return 0, False
+    sealed = store_seal.CONTENT in own
+    for left in () if sealed else path.rglob("*.partial"):
+        left.unlink()  # a killed export was writing it
     try:
         store_seal.check_zarr(path)
-        if complete:
+        if sealed:
             store_seal.verify_zarr(path)
-        with xr.open_zarr(path, consolidated=True, chunks=None, zarr_format=2) as stored:
-            numbers, times = stored[files.dimension].values, stored[CHANGED].values
-            both = min(len(numbers), len(files))
-            same = (numbers[:both] == np.array(files.numbers)[:both]) & (times[:both] == changed[:both])
+        with xr.open_zarr(path, consolidated=False, chunks=None, zarr_format=3) as stored:
+            both = min(validate(int, own.get(WRITTEN)), len(files))
+            numbers, times = (stored[name].values[:both] for name in (files.dimension, CHANGED))
+            same = (numbers == np.array(files.numbers)[:both]) & (times == changed[:both])
             kept = int(both if same.all() else same.argmin())
-            return kept if complete else _readable(stored, files.dimension, kept, length)
+            kept = kept if sealed else _readable(stored[files.names], files.dimension, kept, length)
+            return kept, sealed and own[WRITTEN] == len(files)
     except Exception as error:  # readers of damaged stores raise whatever they meet
         reason = error.reason if isinstance(error, DamagedFile) else f"{type(error).__name__}: {error}"
         log.warning("%s: damaged, written anew: %s", path, " ".join(reason.split())[:300])
-        return None
+        return 0, False
 
 
 def _readable(stored: xr.Dataset, dimension: str, kept: int, length: int) -> int:
@@ -328,55 +350,13 @@ def _readable(stored: xr.Dataset, dimension: str, kept: int, length: int) -> int
     return whole
 
 
-def _plain_attributes(path: Path) -> dict[str, Any]:
-    try:
-        return store_seal.zarr_attributes(path)
-    except DamagedFile:
-        return {}
+def _encoding(packed: xr.Dataset, dimension: str, chunks: tuple[int, ...]) -> dict[str, dict[str, Any]]:
+    """Return chunks and codecs of the arrays of a store."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
 
-
-def _create(
-    block: xr.Dataset, path: Path, attributes: Mapping[str, Any], dimension: str, chunks: tuple[int, ...]
-) -> None:
-    """Create the arrays of a store, empty along the pairs."""
-    from numcodecs import Shuffle, Zstd  # type: ignore[import-untyped]
-
-    packed = datasets.packed(block.isel({dimension: slice(0, 0)}), attributes)
-    packed.attrs = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in packed.attrs.items()}
-    encoding: dict[str, dict[str, Any]] = {}
+    codecs = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle"), Crc32cCodec()
+    encoding: dict[str, dict[str, Any]] = {str(name): {"compressors": codecs} for name in packed.variables}
     for name, variable in packed.variables.items():
-        variable.attrs = {key: np.asarray(value).tolist() for key, value in variable.attrs.items()}
-        variable.encoding = {}
-        size = 1 if variable.dtype == bool else variable.dtype.itemsize
-        own: dict[str, Any] = {
-            "compressors": (Zstd(level=1, checksum=True),),
-            "filters": [Shuffle(size)] if size > 1 else None,
-        }
         if dimension in variable.dims:
-            own["chunks"] = chunks if variable.ndim > 1 else (CHUNK_NUMBERS,)
-        encoding[str(name)] = own
-    with replacing_folder(path) as scratch:
-        packed.to_zarr(scratch, mode="w", consolidated=False, encoding=encoding, zarr_format=2)
-
-
-def _resize(
-    zarr: Any,
-    path: Path,
-    dimension: str,
-    length: int,
-    *,
-    complete: int,
-    block: xr.Dataset | None = None,
-    first: int = 0,
-) -> None:
-    """Set the length of all arrays along the pairs, write a block from `first` on, and consolidate the metadata."""
-    group = _group(zarr, path)
-    group.attrs[COMPLETE] = complete
-    for name, array in group.arrays():
-        if dimension in array.attrs["_ARRAY_DIMENSIONS"]:
-            if array.shape[0] != length:
-                array.resize((length, *array.shape[1:]))
-            if block is not None:
-                array = group[name]
-                array[first:length] = block[name].values.astype(array.dtype)
-    zarr.consolidate_metadata(str(path), zarr_format=2)
+            encoding[str(name)]["chunks"] = chunks if variable.ndim > 1 else (CHUNK_NUMBERS,)
+    return encoding
