@@ -17,7 +17,7 @@ from support.vector_sets import random_vectors
 import lfpiv
 from lfpiv import records
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Recording
 from lfpiv.records import RecordError
 from lfpiv.results import datasets, netcdf, provenance, summary_file
 from lfpiv.results.folder import Folder, make_writable
@@ -266,7 +266,7 @@ def vectors_file(folder):
 def volume_file(folder):
     volume = abs(random_vectors(0)["u"]).astype(np.float32)
     record = FrameRecord(structure={"left": 0.5}, warnings=(WARNING,), seconds=1.0)
-    frame = Frame(name="a", number=0)
+    frame = Recording().frame(0)
     origin = {"pair": 0, "frame": "a"}
     stamp = provenance.Stamp({"volume": 1})
     file = VolumeFile(frame=frame, path=folder / "pair_0000_a.nc", stamp=stamp, origin=origin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from pydantic import ConfigDict
@@ -14,11 +14,11 @@ from lfpiv.errors import InputError
 from lfpiv.experiment import images
 from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.recording import Frame, Recording
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.prompt import Card, Shown, count, seconds, times
-from lfpiv.settings.particles import Series
 from lfpiv.settings.processing import Bootstrap, Compute, Correlation, Network, SelfCalibration, Smart, Tracking
 from lfpiv.settings.rig import Board, RawImages
 
@@ -65,15 +65,6 @@ class CameraSetup:
         return None if self.orientation is None else self.orientation.yaw_deg
 
 
-class Frame(NamedTuple):
-    """One exposure of all cameras: a frame of a pair, or an instant of a series."""
-
-    number: int
-    """Number of the pair, or of the instant."""
-    name: str
-    """Name of the frame in its pair; an instant of a series has that of the first frame."""
-
-
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Experiment(Shown):
     """An experiment with checked settings and images. Made by `open_experiment`."""
@@ -89,10 +80,8 @@ class Experiment(Shown):
     grid: Grid
     guard_mm: float | tuple[float, float, float] | Literal["auto"]
     """Thickness of the guard layers beyond the grid's faces, one number or (x, y, z) [mm], or "auto"."""
-    pairs: int
-    """Number of pairs; the last `step` instants of a series are the first of no pair."""
-    frames: tuple[str, str]
-    """Names of the two frames of a pair."""
+    recording: Recording
+    """Numbers and names of the frames and pairs."""
     smart: Smart
     correlation: Correlation
     network: Network
@@ -106,15 +95,13 @@ class Experiment(Shown):
     """How many pairs are simulated to measure the damping by ghosts."""
     background: str = "none"
     """Estimate of the light that stands still: "auto", "none", "minimum" or "median"."""
-    series: Series | None = None
-    """The time series; None for image pairs."""
     tracking: Tracking | None = None
     """Settings of the tracking of particles; None without it."""
 
     def card(self) -> Card:
         """Return what matters of the experiment, for people."""
         grid, board = self.grid, self.board
-        what = count(self.pairs, "image pair") if self.series is None else count(self.series.instants, "instant")
+        what = self.recording.text
         size = [n * grid.voxel_mm for n in grid.shape[::-1]]
         guard_mm = self.guard_mm if isinstance(self.guard_mm, str | tuple) else (self.guard_mm,)
         planes = count(len(board.planes_mm), "plane")
@@ -142,31 +129,30 @@ class Experiment(Shown):
     @property
     def numbers(self) -> range:
         """Numbers of all pairs, in a series those of their first instants."""
-        first = 0 if self.series is None else self.series.first
-        return range(first, first + self.pairs)
+        return self.recording.numbers
 
-    def instant(self, pair: int, frame: str) -> int:
-        """Return the number of the instant of a series at which a frame of a pair was recorded."""
-        assert self.series is not None
-        return pair + self.series.step * self.frames.index(frame)
+    @property
+    def pairs(self) -> int:
+        """Number of pairs; the last `step` instants of a series are the first of no pair."""
+        return self.recording.pairs
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """Names of the two frames of a pair."""
+        return self.recording.names
+
+    @property
+    def laser_names(self) -> tuple[str, ...]:
+        """Names of the frames that each have a laser. One laser lights all instants of a series."""
+        return self.frames[: self.recording.lasers]
 
     def pair_frames(self, pair: int) -> tuple[Frame, Frame]:
         """Return both frames of a pair. An instant of a series is the same frame in both its pairs."""
-        first, second = self.frames
-        if self.series is None:
-            return Frame(pair, first), Frame(pair, second)
-        return Frame(pair, first), Frame(pair + self.series.step, first)
+        return self.recording.of_pair(pair)
 
     def all_frames(self) -> Iterator[Frame]:
-        """Yield both frames of each pair."""
+        """Yield all frames that belong to a pair."""
         return (frame for pair in self.numbers for frame in self.pair_frames(pair))
-
-    def fields(self, frame: Frame) -> dict[str, Any]:
-        """Return the fields of path patterns of a frame."""
-        if self.series is not None:
-            return {"instant": frame.number}
-        number, name = frame
-        return {"pair": number, "frame": name, "image": 2 * number + self.frames.index(name)}
 
     def solid(self, frame: Frame, grid: Grid | None = None) -> np.ndarray | None:
         """Return the flags of the voxels without fluid in a frame, shape (z, y, x); None without a mask.
@@ -184,7 +170,7 @@ class Experiment(Shown):
         """
         if self.mask is None:
             return None
-        flags = self.mask.flags(self.fields(frame))
+        flags = self.mask.flags(frame.fields)
         grid = self.grid if grid is None else grid
         return flags if grid == self.mask.grid else np.ascontiguousarray(flags[grid.nearest_in(self.mask.grid)])
 
@@ -192,17 +178,12 @@ class Experiment(Shown):
         """Return the files of the masks of some frames, each once; none if no file is read."""
         if self.mask is None or self.mask.file is None:
             return []
-        return list(dict.fromkeys(self.mask.file_of(self.fields(frame)) for frame in frames))
+        return list(dict.fromkeys(self.mask.file_of(frame.fields) for frame in frames))
 
     @property
     def in_sequence(self) -> bool:
         """Whether each instant of a series is reconstructed from the one before."""
-        return self.series is not None and self.smart.predict
-
-    def instant_s(self, instant: int) -> float:
-        """Return the time of an instant of a series after the first one [s]."""
-        assert self.series is not None
-        return (instant - self.series.first) * self.dt_s / self.series.step
+        return self.recording.is_series and self.smart.predict
 
     def name_of(self, pair: int) -> str:
         """Return "pair" or, in a series, "instant" with the number, for messages."""
@@ -211,7 +192,7 @@ class Experiment(Shown):
     @property
     def noun(self) -> str:
         """What results are numbered by: "pair" or "instant"."""
-        return "pair" if self.series is None else "instant"
+        return self.recording.noun
 
     def disjoint(self, pairs: Iterable[int]) -> Iterator[int]:
         """Yield the pairs that share no image with one yielded before."""
@@ -247,7 +228,11 @@ class Experiment(Shown):
 
     def particle_image(self, name: str, pair: int, frame: str) -> np.ndarray:
         """Return a particle image [counts], float32 (rows, columns); raise InputError if it has no contrast."""
-        label, path = self.particle_label(name, pair, frame), self.particle_path(name, pair, frame)
+        return self.frame_image(name, self.pair_frames(pair)[self.frames.index(frame)])
+
+    def frame_image(self, name: str, frame: Frame) -> np.ndarray:
+        """Return a camera's image of a frame as `particle_image` does."""
+        label, path = self.frame_label(name, frame), self.frame_path(name, frame)
         image = read_image_of(path, label, self.camera(name))
         images.require_contrast(image, path, label)
         return image
@@ -268,13 +253,15 @@ class Experiment(Shown):
 
     def particle_path(self, name: str, pair: int, frame: str) -> Path:
         """Return the path of a particle image."""
-        at = Frame(pair if self.series is None else self.instant(pair, frame), frame)
-        return self.path.parent / self.particle_images.format(camera=name, **self.fields(at))
+        return self.frame_path(name, self.pair_frames(pair)[self.frames.index(frame)])
 
-    def particle_label(self, name: str, pair: int, frame: str) -> str:
+    def frame_path(self, name: str, frame: Frame) -> Path:
+        """Return the path of a camera's image of a frame."""
+        return self.path.parent / self.particle_images.format(camera=name, **frame.fields)
+
+    def frame_label(self, name: str, frame: Frame) -> str:
         """Return key, camera and number of a particle image, for messages."""
-        number = f"pair {pair}, frame {frame!r}" if self.series is None else f"instant {self.instant(pair, frame)}"
-        return f"particles.images, camera {name!r}, {number}"
+        return f"particles.images, camera {name!r}, {frame.label}"
 
     def calibration_images(self, cameras: Sequence[CameraSetup] | None = None) -> list[ImagePath]:
         """Return all images that the calibration reads, in a fixed order; `cameras` are all unless some are given."""
@@ -309,7 +296,7 @@ class Experiment(Shown):
 
     def frame_images(self, frame: Frame) -> list[ImagePath]:
         """Return the images of one frame, in the order of the cameras."""
-        return [split(self.particle_path(camera.name, *frame), camera.raw) for camera in self.cameras]
+        return [split(self.frame_path(camera.name, frame), camera.raw) for camera in self.cameras]
 
     def pair_images(self, pair: int) -> list[ImagePath]:
         """Return all images of one pair, in a fixed order."""

@@ -14,6 +14,7 @@ from lfpiv.experiment import axes, images, nominal_checks, recorded, scale_check
 from lfpiv.experiment.experiment import CameraSetup, Experiment, board_label, check_shape
 from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.patterns import check_length, check_pattern
+from lfpiv.experiment.recording import Recording
 from lfpiv.experiment.toml import parse, read_text, read_toml
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.settings import bounds
@@ -80,9 +81,7 @@ def read_experiment(path: str | Path) -> Experiment:
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
-        pairs=particles.count,
-        frames=particles.frames,
-        series=particles.series,
+        recording=Recording.of_table(particles),
         smart=table.smart,
         self_calibration=table.self_calibration,
         bootstrap=table.bootstrap,
@@ -100,7 +99,7 @@ def read_experiment(path: str | Path) -> Experiment:
             nominal_checks.require_volume(path, grid, camera.name, camera.optics, camera.orientation)
     _check_calibration_images(experiment)
     if experiment.mask is not None:
-        experiment.mask.look_at(map(experiment.fields, experiment.all_frames()))
+        experiment.mask.look_at(frame.fields for frame in experiment.all_frames())
     return experiment
 
 
@@ -120,16 +119,16 @@ def check_tables(path: Path, table: ExperimentTable) -> None:
         if not table.board.mark:
             _require_orientation(path, one)
     board, particles = table.board, table.particles
+    recording = Recording.of_table(particles)
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
-    check_pattern(path, "particles.images", particles.images, {"camera": names, **_fields(particles, particles.images)})
+    check_pattern(path, "particles.images", particles.images, {"camera": names, **_fields(recording, particles.images)})
     if table.volume.mask is not None:
-        check_pattern(path, "volume.mask", table.volume.mask, _fields(particles, table.volume.mask), optional=True)
+        check_pattern(path, "volume.mask", table.volume.mask, _fields(recording, table.volume.mask), optional=True)
     for one in table.camera:
         if one.background_image is not None:
             _check_background(path, one, particles)
-    series = particles.series
-    if table.smart.estimate == "joint" and (series is not None or len(table.camera) < 2):
-        where = "a time series, where each instant is reconstructed once" if series is not None else "a single camera"
+    if table.smart.estimate == "joint" and (recording.is_series or len(table.camera) < 2):
+        where = "a time series, where each instant is reconstructed once" if recording.is_series else "a single camera"
         raise InputError(
             f"{path}: smart.estimate: expected 'correlation' for {where}, found 'joint'. Set it to 'correlation'."
         )
@@ -182,25 +181,24 @@ def check_pairs(experiment: Experiment, pairs: Sequence[int]) -> Iterator[tuple[
     for number, pair in enumerate(pairs):
         try:
             for camera in experiment.cameras:
-                for frame in experiment.frames:
-                    label = experiment.particle_label(camera.name, pair, frame)
-                    check_shape(experiment.particle_path(camera.name, pair, frame), label, camera)
+                for frame in experiment.pair_frames(pair):
+                    check_shape(
+                        experiment.frame_path(camera.name, frame), experiment.frame_label(camera.name, frame), camera
+                    )
             decoded += 2 * sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
             if number == 0 or decoded <= DECODED_PIXELS:
                 for camera in experiment.cameras:
-                    for frame in experiment.frames:
-                        experiment.particle_image(camera.name, pair, frame)
+                    for frame in experiment.pair_frames(pair):
+                        experiment.frame_image(camera.name, frame)
         except InputError as error:
             yield pair, str(error)
 
 
-def _fields(particles: Particles, pattern: str) -> dict[str, Sequence[Any]]:
+def _fields(recording: Recording, pattern: str) -> dict[str, Sequence[Any]]:
     """Return the fields that tell the frames apart in a path pattern, with their values."""
-    if (series := particles.series) is not None:
-        return {"instant": series.numbers}
-    if "{image" in pattern:
-        return {"image": range(2 * particles.count)}
-    return {"pair": range(particles.count), "frame": particles.frames}
+    if recording.is_series:
+        return {"instant": recording.frames}
+    return {"image": recording.frames} if "{image" in pattern else {"pair": recording.numbers, "frame": recording.names}
 
 
 def _require_orientation(path: Path, camera: CameraTable) -> None:
@@ -215,7 +213,7 @@ def _check_background(path: Path, camera: CameraTable, particles: Particles) -> 
     """Refuse a pattern with unknown fields, and an image that `particles.background` would not use."""
     key = f"camera {camera.name!r}, background_image"
     assert camera.background_image is not None
-    if particles.series is not None and "{frame" in camera.background_image:
+    if particles.instants is not None and "{frame" in camera.background_image:
         raise InputError(
             f"{path}: {key}: expected no {{frame}}, because one laser lights all instants of a time series, found "
             f"{camera.background_image!r}."

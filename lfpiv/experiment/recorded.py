@@ -12,11 +12,11 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.experiment.readers.source import ImagePath, NoSuchImage, split
 from lfpiv.experiment.readers.table import READERS
+from lfpiv.experiment.recording import Frame
 
 MOST_PROBED = 10_000
 """Largest number of images that are looked for by name inside a file."""
@@ -56,10 +56,10 @@ class Missing:
     @property
     def pairs_at_end(self) -> range:
         """Pairs at the end that cannot be done; those of a series need the instant `step` later."""
-        series, pairs = self.experiment.series, self.experiment.numbers
+        recording, pairs = self.experiment.recording, self.experiment.numbers
         if not self.end:
             return range(0)
-        return range(max(self.end.start - (0 if series is None else series.step), pairs.start), pairs.stop)
+        return range(max(self.end.start - (recording.chain or 0), pairs.start), pairs.stop)
 
     def message(self) -> str:
         """Return key, pattern, stated and found numbers, which are missing, and what to do."""
@@ -76,11 +76,10 @@ class Missing:
     def _way(self) -> str:
         noun, stated = self.experiment.noun, self.stated
         if self.counts_from_one:
-            if self.experiment.series is not None:
+            if self.experiment.recording.is_series:
                 return f"The images count from {stated.start + 1}: state particles.first = {stated.start + 1}."
             return f"The images count from 1 to {stated.stop}, pairs count from 0: rename the images."
-        step = 0 if self.experiment.series is None else self.experiment.series.step
-        if self.end and (enough := self.end.start - stated.start) > step:
+        if self.end and (enough := self.end.start - stated.start) > (self.experiment.recording.chain or 0):
             return f"State particles.{noun}s = {enough}, or add the images."
         return "Add the images."
 
@@ -90,7 +89,8 @@ def missing(experiment: Experiment) -> Missing | None:
 
     A file that cannot be listed or opened counts as there; its own check explains why.
     """
-    stated = experiment.numbers if experiment.series is None else experiment.series.numbers
+    recording = experiment.recording
+    stated = recording.frames if recording.is_series else recording.numbers
     complete: set[int] | None = None
     some: set[int] = set()
     for sequence in _sequences(experiment):
@@ -129,38 +129,35 @@ def _gaps(there: list[int], stated: range) -> Iterator[range]:
 
 @dataclass(frozen=True)
 class _Sequence:
-    """Images of one camera, and for pairs of one frame, one for each number."""
+    """Images of one camera by one laser, one for each number."""
 
     experiment: Experiment
     camera: CameraSetup
-    frame: int
-    """0 or 1; 0 for a series."""
+    laser: int
 
     @property
     def per_number(self) -> int:
         """Distance of the numbers in the paths of successive images."""
-        return 2 if self.experiment.series is None and "{image" in self.experiment.particle_images else 1
+        return self.experiment.recording.lasers if "{image" in self.experiment.particle_images else 1
 
-    def image(self, number: Any) -> ImagePath:
+    def frame(self, number: int) -> Frame:
+        """Return the frame of a pair or an instant."""
+        recording = self.experiment.recording
+        return recording.frame(recording.lasers * number + self.laser)
+
+    def image(self, number: int) -> ImagePath:
         """Return the image of a pair or an instant."""
-        experiment = self.experiment
-        if experiment.series is not None:
-            fields = {"instant": number}
-        else:
-            count = number if isinstance(number, _Hole) else 2 * number + self.frame
-            fields = {"pair": number, "frame": experiment.frames[self.frame], "image": count}
-        text = experiment.particle_images.format(camera=self.camera.name, **fields)
-        return split(experiment.path.parent / text, self.camera.raw)
+        return split(self.experiment.frame_path(self.camera.name, self.frame(number)), self.camera.raw)
 
     def label(self, number: int) -> str:
         """Return key, camera and number of an image, for messages."""
-        pair = number if self.experiment.series is None else self.experiment.numbers.start
-        label = self.experiment.particle_label(self.camera.name, pair, self.experiment.frames[self.frame])
-        return label if self.experiment.series is None else f"{label.rpartition(' ')[0]} {number}"
+        return self.experiment.frame_label(self.camera.name, self.frame(number))
 
     def present(self, numbers: range) -> set[int] | None:
         """Return the numbers of the images that there are; None where that is not known."""
-        pattern = self.image(_Hole())
+        fields = dict.fromkeys(("pair", "instant", "image"), _Hole()) | {"frame": self.frame(numbers.start).name}
+        path = self.experiment.particle_images.format(camera=self.camera.name, **fields)
+        pattern = split(self.experiment.path.parent / path, self.camera.raw)
         if _HOLE in str(pattern.file):
             return self._listed(pattern.file, numbers)
         return self._inside(numbers) if _HOLE in pattern.part else None
@@ -175,7 +172,7 @@ class _Sequence:
                 for entry in entries:
                     match = form.fullmatch(entry.name)
                     if match is not None and len(match[1]) <= MOST_DIGITS:
-                        number, rest = divmod(int(match[1]) - self.frame * (self.per_number - 1), self.per_number)
+                        number, rest = divmod(int(match[1]) - self.laser * (self.per_number - 1), self.per_number)
                         if rest == 0 and number in numbers and self._is_named(number, entry, place):
                             found.add(number)
         except FileNotFoundError:
@@ -205,8 +202,8 @@ class _Sequence:
 
 
 def _sequences(experiment: Experiment) -> list[_Sequence]:
-    frames = (0, 1) if experiment.series is None else (0,)
-    return [_Sequence(experiment, camera, frame) for camera in experiment.cameras for frame in frames]
+    lasers = range(experiment.recording.lasers)
+    return [_Sequence(experiment, camera, laser) for camera in experiment.cameras for laser in lasers]
 
 
 def _in_order(image: ImagePath) -> bool:

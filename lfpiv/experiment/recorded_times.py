@@ -123,16 +123,16 @@ def _apart(first: ImagePath, second: ImagePath, one: Recorded, two: Recorded) ->
 
 def _times(experiment: Experiment, camera: int) -> Iterator[Times]:
     """Yield what is known of some pairs of a camera, and of a series from its first instant to its last."""
-    series = experiment.series
+    recording = experiment.recording
     for pair in experiment.spread_pairs(LOOKED_AT):
         first, second = (experiment.frame_images(frame)[camera] for frame in experiment.pair_frames(pair))
-        times = between(first, second, is_series=series is not None)
-        if times is not None and (series is None or times.is_sharp):
+        times = between(first, second, is_series=recording.is_series)
+        if times is not None and (times.is_sharp or not recording.is_series):
             yield times
-    if series is not None:
-        ends = [experiment.pair_frames(pair)[at] for at, pair in enumerate((series.first, experiment.numbers[-1]))]
+    if recording.is_series:
+        ends = [recording.frame(number) for number in (recording.frames[0], recording.frames[-1])]
         first, second = (experiment.frame_images(frame)[camera] for frame in ends)
-        steps = (ends[1].number - ends[0].number) / series.step
+        steps = (ends[1].number - ends[0].number) / recording.step
         if (times := between(first, second, is_series=True)) is not None:
             yield Times(times.least / steps, times.most / steps)
 

@@ -7,8 +7,6 @@ of an instant depends on its own images and on those of a known range of instant
 
 from __future__ import annotations
 
-from lfpiv.settings.particles import Series
-
 SEGMENT = 64
 """Number of instants of a segment. The number of its first one is a multiple of it."""
 LEAD_IN = 6
@@ -22,20 +20,20 @@ def segment_of(instant: int) -> int:
     return instant // SEGMENT
 
 
-def followed(series: Series, instant: int) -> range:
+def followed(frames: range, instant: int) -> range:
     """Return the instants that are reconstructed in turn up to and with an instant.
 
-    They begin with those that lead into its segment, as far as the series has them.
+    They begin with those that lead into its segment, as far as `frames`, the numbers of all instants, have them.
     """
-    start = max(segment_of(instant) * SEGMENT - LEAD_IN, series.first)
+    start = max(segment_of(instant) * SEGMENT - LEAD_IN, frames.start)
     return range(start, instant + 1)
 
 
-def depended_on(series: Series, instant: int) -> list[int]:
+def depended_on(frames: range, instant: int) -> list[int]:
     """Return the other instants on whose images an instant depends: those it follows, and those that correct it."""
-    return [*followed(series, instant)[:-1], *corrected_by(series, instant)]
+    return [*followed(frames, instant)[:-1], *corrected_by(frames, instant)]
 
 
-def corrected_by(series: Series, instant: int) -> range:
+def corrected_by(frames: range, instant: int) -> range:
     """Return the instants after one by which it is corrected, as far as the series has them."""
-    return range(instant + 1, min(instant + REACH, series.numbers[-1]) + 1)
+    return range(instant + 1, min(instant + REACH, frames[-1]) + 1)

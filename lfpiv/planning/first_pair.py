@@ -90,17 +90,17 @@ def measure(run: Run, calibration: Calibration, scratch: Path, *, calibrated: bo
     light, read, recorded = _light(experiment, weights)
     images = _before_weights(experiment, calibration, light, read)
     _, cameras = _timed(lambda: _compare(experiment, weights, light, recorded and calibrated))
-    work = rig.pair_work(replace(run, folder=Folder(scratch, experiment.series)), weights, keep_volumes=False)
+    work = rig.pair_work(replace(run, folder=Folder(scratch, experiment.recording)), weights, keep_volumes=False)
     coming = iter(light)
 
     def solve() -> tuple[FrameVolume, FrameVolume]:
-        if experiment.series is None:
+        if not experiment.recording.is_series:
             return work.reconstructor.pair(light, number, lambda _: None)
         found = work.reconstructor.instant(next(coming), lambda _: None)
         return found, found
 
     (_, first), (volumes, solved) = _timed(solve), _timed(solve)
-    both = PairVolumes(frames=volumes, names=experiment.frames if experiment.series is None else ("a", "b"))
+    both = PairVolumes(frames=volumes, names=experiment.frames)
     (_, loaded), (vectors, correlated) = (_timed(lambda: work.vectors_between(number, both)) for _ in range(2))
     file = work.files(number)
     _, written = _timed(lambda: work.result(file, vectors, both)[1]())
@@ -110,7 +110,7 @@ def measure(run: Run, calibration: Calibration, scratch: Path, *, calibrated: bo
         images=images,
         once=(first - solved) + (loaded - correlated),
         steps={
-            "images": read * (2 if experiment.series is None else 1),
+            "images": read * experiment.recording.lasers,
             "reconstruction": solved,
             "correlation": correlated,
             "writing": written,
@@ -174,7 +174,7 @@ def _before_weights(
     _, cost = _timed(lambda: light_beyond(calibration, experiment.grid, [images]))
     if experiment.smart.refinement == "auto":
         cost += _timed(lambda: measure_size(calibration, experiment.grid, images))[1]
-    standing = 2 * len(background.series(experiment)) // (1 if experiment.series is None else 2)
+    standing = len(background.series(experiment)) * experiment.recording.lasers
     return cost + read * (standing + 2 * min(SAMPLED, experiment.pairs))
 
 

@@ -38,7 +38,8 @@ def section(experiment: Experiment, calibration: Calibration) -> str:
     heads = ["camera", "part of the sensor", "unusable pixels", "stray light [counts]", "second frame over first"]
     parts = ['<h2 id="background">Light that stands still</h2>']
     for name, found in cameras.items():
-        titles = [f"{name}, frame {frame}" for frame in experiment.frames] if experiment.series is None else [name]
+        lasers = experiment.laser_names
+        titles = [name] if len(lasers) == 1 else [f"{name}, frame {frame}" for frame in lasers]
         shown = [_picture(light, found, title) for title, light in zip(titles, found.light, strict=False)]
         parts.append(
             markup.figure(

@@ -19,8 +19,7 @@ class Naming:
     @classmethod
     def of(cls, experiment: Experiment) -> Naming:
         """Return the names of an experiment's results."""
-        series = experiment.series
-        return cls(noun=experiment.noun, step=None if series is None else series.step)
+        return cls(noun=experiment.noun, step=experiment.recording.chain)
 
     def result(self, number: int) -> str:
         """Name a vector field."""

@@ -23,8 +23,7 @@ def head(experiment: Experiment) -> str:
     nz, ny, nx = experiment.grid.shape
     voxel = experiment.grid.voxel_mm
     size = " × ".join(f"{n * voxel:g}" for n in (nx, ny, nz))
-    series = experiment.series
-    apart = "between frames" if series is None else f"between instants{_later(series.step)}"
+    apart = f"between {experiment.recording.exposure}s{experiment.recording.later}"
     return f'<h1 id="top">{markup.escape(experiment.name)}</h1>' + markup.paragraph(
         f"Light-field PIV with {markup.count(len(experiment.cameras), 'camera')}, {size} mm (x, y, z), "
         f"{quantity(experiment.dt_s, 's')} {apart}. One voxel of {voxel:g} mm is "
@@ -114,11 +113,9 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
 
 def _interval(experiment: Experiment) -> tuple[str, str]:
     """State the time between the two frames of a vector field and the velocity of one voxel."""
-    series, interval = experiment.series, quantity(experiment.dt_s, "s", 6)
+    recording, interval = experiment.recording, quantity(experiment.dt_s, "s", 6)
     speed = f"1 voxel is {quantity(experiment.grid.voxel_mm / 1000 / experiment.dt_s, 'm/s')}"
-    if series is None:
-        return "Time between frames", f"{interval}: {speed}"
-    return "Time between instants", f"{interval}{_later(series.step)}: {speed}"
+    return f"Time between {recording.exposure}s", f"{interval}{recording.later}: {speed}"
 
 
 def _moved(experiment: Experiment, summary: Summary) -> tuple[str, str]:
@@ -130,19 +127,14 @@ def _moved(experiment: Experiment, summary: Summary) -> tuple[str, str]:
     return "Median movement", f"{text}, in {experiment.name_of(pair.number)}"
 
 
-def _later(step: int) -> str:
-    return "" if step == 1 else f", from each to the one {step} later"
-
-
 def _recorded(experiment: Experiment, finished: int) -> tuple[str, str]:
     """State what was recorded, and how much of it has vectors."""
-    series = experiment.series
-    if series is None:
+    recording, frames = experiment.recording, experiment.recording.frames
+    if not recording.is_series:
         return "Image pairs", f"{finished:,} of {experiment.pairs:,} finished"
-    last = series.first + series.instants - 1
     return "Time series", (
-        f"instants {series.first} to {last}; vectors of {finished:,} of the {experiment.pairs:,} that have a partner "
-        f"{markup.count(series.step, 'instant')} later"
+        f"instants {frames[0]} to {frames[-1]}; vectors of {finished:,} of the {experiment.pairs:,} that have a "
+        f"partner {markup.count(recording.step, 'instant')} later"
     )
 
 

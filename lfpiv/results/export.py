@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.recording import Recording
 from lfpiv.files import writing
 from lfpiv.progress import Progress, StepProgress, ignore_progress
 from lfpiv.records import read_object
@@ -32,11 +33,10 @@ from lfpiv.results import (
     track_files,
 )
 from lfpiv.results import tables as csv_tables
-from lfpiv.results.folder import FRAME_NAMES, Folder, make_writable
+from lfpiv.results.folder import Folder, make_writable
 from lfpiv.results.left_out import LeftOut
 from lfpiv.results.reader import open_results
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
-from lfpiv.settings.particles import Series
 from lfpiv.velocity import derived
 from lfpiv.version import versions
 
@@ -197,7 +197,7 @@ def _folder(path: Path, files: StackedFiles) -> Folder:
     if files.dimension == PAIR:
         return Folder(path)
     first, step = int(files.numbers[0]), int(files.first.attrs.get("step", 1))
-    return Folder(path, Series(instants=len(files) + step, first=first, step=step))
+    return Folder(path, Recording.of_series(len(files) + step, first, step))
 
 
 def _nearest(depths: xr.DataArray, depth_mm: float) -> np.ndarray:
@@ -262,17 +262,14 @@ def _write_vti(
         path = target / f"{_stem(results, pair)}.vti"
         paraview.write_image(_vector_arrays(vectors), vectors, path)
         collections.setdefault("vectors", {})[path] = times[pair]
-        for frame, name in enumerate(FRAME_NAMES if folder.series is None else FRAME_NAMES[:1]):
-            stored = folder.volume(pair, frame)
+        for stored in folder.new_volumes(pair):
             if not stored.is_file() or stored in unfit:
                 continue
             volume = netcdf.read_volume(stored)
-            path = target / f"volume_{pair:04d}_{name}.vti"
-            if folder.series is not None:
-                path = target / f"volume_{pair:06d}.vti"
+            _, number, *frame = stored.stem.split("_")
+            path = target / f"{'_'.join(['volume', number, *frame])}.vti"
             paraview.write_image({"intensity": volume.values}, volume, path)
-            kind = f"volumes_{name}" if folder.series is None else "volumes"
-            collections.setdefault(kind, {})[path] = times[pair]
+            collections.setdefault("_".join(["volumes", *frame]), {})[path] = times[pair]
     written = []
     for name, files in collections.items():
         path = target / f"{name}.pvd"
@@ -283,10 +280,7 @@ def _write_vti(
 
 def _unfit_volumes(results: xr.Dataset, folder: Folder) -> frozenset[Path]:
     """Return the stored volumes that were made from other settings or images than the vectors."""
-    frames = range(len(FRAME_NAMES) if folder.series is None else 1)
-    stored = (
-        (pair, folder.volume(pair, frame)) for pair in results[_along(results)].values.tolist() for frame in frames
-    )
+    stored = ((pair, path) for pair in results[_along(results)].values.tolist() for path in folder.new_volumes(pair))
     return frozenset(path for pair, path in stored if path.is_file() and not _same_origin(path, folder.vectors(pair)))
 
 

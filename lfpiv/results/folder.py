@@ -16,19 +16,16 @@ import socket
 import stat
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from lfpiv.errors import InputError
+from lfpiv.experiment.recording import Recording
 from lfpiv.files import remove_leftovers, writing
 from lfpiv.records import RecordError, read_object, validate
-from lfpiv.settings.particles import Series
 from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
-
-FRAME_NAMES = "ab"
-"""Names of the two frames in output files, independent of the names of the images."""
 
 TRACKS = "tracks.nc"
 """Name of the table of tracks in the folder of a run."""
@@ -47,8 +44,8 @@ class Folder:
     """Paths of the files of a run."""
 
     path: Path
-    series: Series | None = None
-    """The time series whose results are here; None for image pairs."""
+    recording: Recording = field(default_factory=Recording)
+    """Names of the pairs and frames whose results are here."""
 
     @property
     def calibration(self) -> Path:
@@ -121,8 +118,7 @@ class Folder:
 
     def vectors(self, pair: int) -> Path:
         """Return the path of one pair's vectors; in a series it has the number of the pair's first instant."""
-        name = f"pair_{pair:04d}" if self.series is None else f"instant_{pair:06d}"
-        return self.path / "vectors" / f"{name}.nc"
+        return self.path / "vectors" / f"{self.recording.stem(pair)}.nc"
 
     def particles(self, pair: int) -> Path:
         """Return the path of one pair's linked particles, named as its vectors."""
@@ -130,10 +126,11 @@ class Folder:
 
     def volume(self, pair: int, frame: int) -> Path:
         """Return the path of a pair's volume of frame 0 or 1; two pairs of a series share an instant's volume."""
-        name = f"pair_{pair:04d}_{FRAME_NAMES[frame]}"
-        if self.series is not None:
-            name = f"instant_{pair + frame * self.series.step:06d}"
-        return self.path / "volumes" / f"{name}.nc"
+        return self.path / "volumes" / f"{self.recording.frame_of(pair, frame).stem}.nc"
+
+    def new_volumes(self, pair: int) -> list[Path]:
+        """Return the paths of a pair's volumes that no later pair has: both, or that of the first instant."""
+        return [self.volume(pair, frame) for frame in range(self.recording.lasers)]
 
     def stored(self, numbers: range, *, vectors: bool, volumes: bool) -> bytearray:
         """Return for each pair 1 if all its files are there, 0 otherwise. This lists folders and opens no file."""

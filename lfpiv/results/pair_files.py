@@ -18,7 +18,8 @@ import xarray as xr
 
 from lfpiv import warn
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
 from lfpiv.records import read_json, validate
@@ -171,18 +172,17 @@ class PairFiles:
                 frame=frames[number],
                 path=folder.volume(pair, number),
                 stamp=stamps.volumes[number],
-                origin=_origin(experiment, frames[number]),
+                origin=experiment.recording.frame_origin(frames[number], experiment.dt_s),
                 grid=experiment.grid,
             )
             for number in (0, 1)
         )
-        origin = {"pair": pair} if experiment.series is None else _instant(experiment, pair)
         return cls(
             pair=pair,
             vectors=folder.vectors(pair),
             stamp=stamps.vectors,
             frames=(first, second),
-            origin=origin,
+            origin=experiment.recording.origin(pair, experiment.dt_s),
             particles=None if stamps.particles is None else folder.particles(pair),
             particles_stamp=stamps.particles,
         )
@@ -259,18 +259,6 @@ class PairFiles:
             attributes = {**self.particles_stamp.attributes, **self.origin}
             write_particles(table, self.particles, attributes=attributes)
             self.particles.with_suffix(RETIRED).unlink(missing_ok=True)
-
-
-def _origin(experiment: Experiment, frame: Frame) -> dict[str, Any]:
-    """Return the attributes that say of what a volume is."""
-    if experiment.series is None:
-        return {"pair": frame.number, "frame": frame.name}
-    return {"instant": frame.number, "time_s": experiment.instant_s(frame.number)}
-
-
-def _instant(experiment: Experiment, instant: int) -> dict[str, Any]:
-    assert experiment.series is not None
-    return {"instant": instant, "step": experiment.series.step, "time_s": experiment.instant_s(instant)}
 
 
 def _read_record(volume: xr.DataArray, path: Path) -> FrameRecord:

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from lfpiv import files
-from lfpiv.experiment.experiment import CameraSetup, Experiment, Frame
+from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.experiment.readers.source import ImagePath, split
+from lfpiv.experiment.recording import Frame
 from lfpiv.experiment.segments import depended_on
 from lfpiv.geometry.grid import NO_LAYERS, Layers
 from lfpiv.results.image_identity import CondensedImages, Images, content_hash, look_at
@@ -82,17 +83,12 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     """
     recorded = {camera.name: camera.background for camera in experiment.cameras}
     start = experiment.path.parent
-    seen = [
-        image
-        for pair in pairs
-        for frame in background_frames(experiment, pair)
-        for image in experiment.frame_images(frame)
-        if image.file.is_file()
-    ]
+    frames = [frame for pair in pairs for frame in experiment.recording.new_frames(pair)]
+    seen = [image for image in _images(experiment, frames) if image.file.is_file()]
     images = [
         split(path, camera.raw)
         for camera in experiment.cameras
-        for frame in lit_frames(experiment)
+        for frame in experiment.laser_names
         if (path := experiment.background_path(camera.name, frame)) is not None
     ]
     return Stamp(
@@ -105,16 +101,6 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
             "images": look_at(seen, start) if None in recorded.values() else None,
         }
     )
-
-
-def lit_frames(experiment: Experiment) -> tuple[str, ...]:
-    """Return the names of the frames that each have a laser. One laser lights all instants of a series."""
-    return experiment.frames if experiment.series is None else experiment.frames[:1]
-
-
-def background_frames(experiment: Experiment, pair: int) -> tuple[Frame, ...]:
-    """Return the frames of a pair from which standing light is estimated: both, or the first instant of a series."""
-    return experiment.pair_frames(pair)[: len(lit_frames(experiment))]
 
 
 def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
@@ -161,41 +147,33 @@ def of_pair(
     `guard` the guard layers of the volumes, `refinement` the edge of their voxels over the edge of reconstructed
     voxels.
     """
-    light, start = _of_light(experiment, calibration, background), experiment.path.parent
-    parts = light | {
+    recording, start = experiment.recording, experiment.path.parent
+    parts = _of_light(experiment, calibration, background) | {
         "guard": guard if guard != NO_LAYERS else None,
         "refinement": refinement if refinement != 1 else None,
     }
-    both_frames = experiment.pair_frames(pair)
-    of_pair = parts | {"images": look_at(experiment.pair_images(pair), start)} | _mask_files(experiment, both_frames)
-    of_vectors = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
+    frames = experiment.pair_frames(pair)
+
+    def seen(some: Sequence[Frame]) -> dict[str, Any]:
+        return {**parts, "images": look_at(_images(experiment, some), start), **_mask_files(experiment, some)}
+
+    of_pair = seen(frames)
+    of_vectors: dict[str, Any] = {"correlation": experiment.correlation.model_dump(), "dt_s": experiment.dt_s}
     if experiment.by_links and experiment.tracking is not None:
         of_vectors["links"] = experiment.tracking.search
-    if experiment.series is None:
-        volumes = Stamp(of_pair)
-        return PairStamps(
-            volumes=(volumes, volumes),
-            vectors=Stamp(of_pair | of_vectors),
-            particles=_of_particles(experiment, of_pair | of_vectors),
-        )
-    first, second = (
-        Stamp(parts | {"images": look_at(experiment.frame_images(instant), start)} | _mask_files(experiment, [instant]))
-        for instant in both_frames
-    )
-    of_vectors["step"] = experiment.series.step
+    volumes = [seen([frame]) for frame in frames] if recording.is_series else [of_pair, of_pair]
+    if recording.is_series:
+        of_vectors["step"] = recording.step
     if experiment.in_sequence:
-        others = [_frames_beside(experiment, instant.number) for instant in both_frames]
-        beside = [look_at(_images(experiment, frames), start, condensed=True) for frames in others]
-        masks = [_mask_files(experiment, [one, *more]) for one, more in zip(both_frames, others, strict=True)]
-        first, second = (
-            Stamp({**stamp.parts, IMAGES_BESIDE: images, **of_masks})
-            for stamp, images, of_masks in zip((first, second), beside, masks, strict=True)
-        )
+        others = [list(map(recording.frame, depended_on(recording.frames, frame.number))) for frame in frames]
+        beside = [look_at(_images(experiment, some), start, condensed=True) for some in others]
+        for volume, own, some, images in zip(volumes, frames, others, beside, strict=True):
+            volume |= {IMAGES_BESIDE: images, **_mask_files(experiment, [own, *some])}
         both = [state for images in beside if images is not None for state in images.states]
         of_vectors[IMAGES_BESIDE] = None if None in beside else CondensedImages(tuple(both))
-        of_vectors |= _mask_files(experiment, [*both_frames, *others[0], *others[1]])
+        of_vectors |= _mask_files(experiment, [*frames, *others[0], *others[1]])
     return PairStamps(
-        volumes=(first, second),
+        volumes=(Stamp(volumes[0]), Stamp(volumes[1])),
         vectors=Stamp(of_pair | of_vectors),
         particles=_of_particles(experiment, of_pair | of_vectors),
     )
@@ -231,12 +209,6 @@ def _of_particles(experiment: Experiment, of_vectors: dict[str, Any]) -> Stamp |
     return None if tracking is None else Stamp(of_vectors | {"tracking": tracking.model_dump()})
 
 
-def _frames_beside(experiment: Experiment, instant: int) -> list[Frame]:
-    """Return the other instants on which one of a sequence depends."""
-    assert experiment.series is not None
-    return [Frame(number, experiment.frames[0]) for number in depended_on(experiment.series, instant)]
-
-
 def _images(experiment: Experiment, frames: Iterable[Frame]) -> list[ImagePath]:
     """Return the images of some frames."""
     return [image for frame in frames for image in experiment.frame_images(frame)]
@@ -255,7 +227,7 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None) 
     compute = experiment.compute
     reach = {"max_displacement_voxel": experiment.correlation.max_displacement_voxel}
     particles: dict[str, Any] = {"images": experiment.particle_images}
-    if experiment.series is None:
+    if not experiment.recording.is_series:
         particles["frames"] = list(experiment.frames)
     return {
         "calibration": calibration,
@@ -281,8 +253,8 @@ def _self_calibration(experiment: Experiment) -> dict[str, Any] | None:
     """Return settings and images of the self-calibration; None if the experiment has none."""
     if not experiment.self_calibration.pairs:
         return None
-    frames = [Frame(pair, experiment.frames[0]) for pair in experiment.self_calibration_pairs]
-    seen = look_at([image for frame in frames for image in experiment.frame_images(frame)], experiment.path.parent)
+    frames = [experiment.recording.frame_of(pair, 0) for pair in experiment.self_calibration_pairs]
+    seen = look_at(_images(experiment, frames), experiment.path.parent)
     content = None if seen is None else files.settings_hash(images=[[s.place, s.digest] for s in seen.states])
     return {**experiment.self_calibration.model_dump(), "images": content}
 

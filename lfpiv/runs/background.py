@@ -110,7 +110,7 @@ def series(experiment: Experiment) -> list[int]:
     A pair of a time series gives one image: in two successive ones the same particles overlap, which chance does not.
     """
     longest = {"median": MEDIAN_PAIRS, "none": WARNING_PAIRS}.get(experiment.background, LONGEST_SERIES)
-    return experiment.spread_pairs(longest if experiment.series is None else 2 * longest)
+    return experiment.spread_pairs(2 * longest // experiment.recording.lasers)
 
 
 def estimate(
@@ -122,7 +122,7 @@ def estimate(
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
             level = experiment.camera(name).white_level
-            images = [experiment.background_image(name, frame) for frame in stamps.lit_frames(experiment)]
+            images = [experiment.background_image(name, frame) for frame in experiment.laser_names]
             found[name] = background.recorded_light(
                 [_without_dark(image, dark, camera, level) for image in images if image is not None], camera.decoder
             )
@@ -169,7 +169,7 @@ def _of_series(
     """Estimate the standing light of one camera from pairs; those that cannot be used are left out."""
     median = experiment.background == "median"
     everywhere = experiment.background == "minimum"
-    chance = experiment.series is not None and not (median or everywhere)
+    chance = experiment.recording.is_series and not (median or everywhere)
     apart = _independent_after(experiment, camera, dark, pairs) if chance else 1
     if apart is None:
         text = "particles move too little within the series to tell their light from light that stands"
@@ -213,7 +213,7 @@ def _light(
 ) -> np.ndarray | None:
     """Return the light of an image; None if it cannot be used."""
     try:
-        return _without_dark(experiment.particle_image(camera.name, *frame), dark, camera, None)[0]
+        return _without_dark(experiment.frame_image(camera.name, frame), dark, camera, None)[0]
     except InputError:
         return None
 
@@ -237,21 +237,20 @@ def _read_series(
     series = Series(camera.decoder, 0, overlapping), Series(camera.decoder, 1, overlapping)
     kept: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for pair in pairs:
-        frames = stamps.background_frames(experiment, pair)
+        frames = experiment.recording.new_frames(pair)
         try:
-            images = [experiment.particle_image(camera.name, *frame) for frame in frames]
+            images = [experiment.frame_image(camera.name, frame) for frame in frames]
         except InputError as error:  # the pair fails when it is reconstructed
             log.debug("background of %s: %s is left out: %s", camera.name, experiment.name_of(pair), error)
             continue
         for frame, image in zip(frames, images, strict=True):
-            number = experiment.frames.index(frame.name)
-            shift = None if experiment.series is None else 2 * (frame.number // apart)
+            shift = 2 * (frame.number // apart) if experiment.recording.is_series else None
             light, noise, saturated = _without_dark(image, dark, camera, experiment.camera(camera.name).white_level)
-            power = 1.0 if estimate is None else estimate.power(light, number)
-            series[number].add(light / np.float32(power), noise / power, saturated, shift)
+            power = 1.0 if estimate is None else estimate.power(light, frame.laser)
+            series[frame.laser].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
-                kept[number].append(light)
-    return series[0], series[1] if experiment.series is None else None, kept
+                kept[frame.laser].append(light)
+    return series[0], series[1] if experiment.recording.lasers > 1 else None, kept
 
 
 def _log_series(experiment: Experiment, name: str, light: StandingLight, count: int) -> None:
@@ -264,7 +263,7 @@ def _log_series(experiment: Experiment, name: str, light: StandingLight, count: 
         log.info("background of %s: nothing stands out in %s, nothing is subtracted", name, images)
         return
     frames = "both frames" if light.ratio is not None else "each frame"
-    if experiment.series is None:
+    if experiment.recording.lasers > 1:
         images = f"{frames} of {images}"
     parts = [f"light stands still in {100 * light.region.mean():.2g} % of the sensor"] if light.region.any() else []
     parts += [f"stray light of {light.stray:.2g} counts lies on all pixels"] if light.stray > LEAST_STRAY else []

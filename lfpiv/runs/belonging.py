@@ -188,7 +188,7 @@ def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[
     Instants of a series show the particles of their neighbours; half a series away there are others.
     """
     near = [late for late in NEIGHBOURS if pair + late in experiment.numbers]
-    if experiment.series is None:
+    if not experiment.recording.is_series:
         return near, []
     half = experiment.pairs // 2
     return [late for late in (half, -half) if half > 2 and pair + late in experiment.numbers], near
@@ -196,7 +196,7 @@ def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[
 
 def _images(experiment: Experiment) -> Sequence[int]:
     """Return the single images by which a camera may be late; in a series these are instants."""
-    return (1, -1) if experiment.series is None else ()
+    return () if experiment.recording.is_series else (1, -1)
 
 
 def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
@@ -244,8 +244,7 @@ def _shared(judged: Sequence[Judgement]) -> Sequence[Mistake]:
 
 
 def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:
-    found = warning.of_pair(pair)
-    return found if experiment.series is None else found.by_instant()
+    return experiment.recording.by_result(warning.of_pair(pair))
 
 
 def _refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> Warning:
@@ -268,9 +267,9 @@ def _words(experiment: Experiment, mistake: Mistake, cameras: Sequence[str]) -> 
             "Exchange them, or the names of the cameras",
         )
     if mistake.kind is Kind.FRAMES:
-        first, second = experiment.frames if experiment.series is None else ("k", f"k + {experiment.series.step}")
-        what = "frames" if experiment.series is None else "instants"
-        return f"the {what} {first} and {second} of {either} are exchanged", "Put the images of that camera into order"
+        first, second = experiment.recording.both
+        what = f"the {experiment.recording.exposure}s {first} and {second} of {either}"
+        return f"{what} are exchanged", "Put the images of that camera into order"
     if mistake.kind in FLIPS:
         how = {
             Kind.HORIZONTAL: "left to right",

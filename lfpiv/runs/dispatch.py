@@ -58,10 +58,8 @@ def _kept(todo: Iterable[int]) -> int:
 
 
 def _stretches(experiment: Experiment, todo: Iterable[int], workers: int) -> Iterable[Stretch]:
-    if experiment.series is None:
-        return cut(todo, None, workers)
-    step = experiment.series.step
-    return cut_at_segments(todo, step) if experiment.in_sequence else cut(todo, step, workers)
+    recording = experiment.recording
+    return cut_at_segments(todo, recording.step) if experiment.in_sequence else cut(todo, recording.chain, workers)
 
 
 def parallel(

@@ -75,43 +75,38 @@ def frame_light(
         If an image is missing, damaged, of another shape, or uniform.
     """
     start = time.perf_counter()
-    label = frame.name if experiment.series is None else None
     images, noise, structure, fingerprints, warnings = {}, {}, {}, {}, list[Warning]()
     clipped = {}
     for name, camera in cameras.items():
-        raw = experiment.particle_image(name, *frame) if read is None else read(name, frame)
+        raw = experiment.frame_image(name, frame) if read is None else read(name, frame)
         top = experiment.camera(name).white_level
         dark = darks[name]
         image = raw if dark is None else raw - dark
         level, noise[name] = camera.decoder.background(image)
         light = image - np.float32(level)
         if camera.standing is not None:
-            light, noise[name] = camera.standing.subtract(light, noise[name], experiment.frames.index(frame.name))
+            light, noise[name] = camera.standing.subtract(light, noise[name], frame.laser)
         images[name] = light
         clipped[name] = saturated_pixels(raw, top)
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
         others = {other: one.decoder for other, one in cameras.items() if other != name}
-        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, label, top, others)
-    warnings += image_checks.signal_warnings(structure, label)
-    if experiment.series is not None:
-        warnings = [replace(warning, instants=(frame.number,)) for warning in warnings]
+        warnings += image_checks.image_warnings(judged, light, camera.decoder, name, frame.name, top, others)
+    warnings += image_checks.signal_warnings(structure, frame.name)
     return FrameLight(
         frame=frame,
         images=images,
         noise=noise,
         structure=structure,
         fingerprints=fingerprints,
-        warnings=tuple(warnings),
+        warnings=tuple(experiment.recording.by_frame(warning, frame) for warning in warnings),
         seconds=time.perf_counter() - start,
         clipped=clipped,
     )
 
 
-def compare(
-    experiment: Experiment, cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: FrameLight
-) -> tuple[Warning, ...]:
+def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: FrameLight) -> tuple[Warning, ...]:
     """Compare both frames of a pair; return the warnings about both.
 
     Raises
@@ -120,7 +115,7 @@ def compare(
         If two images are the same, pixel by pixel.
     """
     image_checks.require_different(
-        (f"{name}, {_name(experiment, one.frame)}", fingerprint)
+        (f"{name}, {one.frame.label}", fingerprint)
         for one in (first, second)
         for name, fingerprint in one.fingerprints.items()
     )
@@ -153,12 +148,8 @@ def pair_light(
         As `frame_light`, and if two images are the same, pixel by pixel.
     """
     first, second = (frame_light(experiment, cameras, darks, frame, read) for frame in experiment.pair_frames(pair))
-    between = compare(experiment, cameras, first, second)
+    between = compare(cameras, first, second)
     return replace(first, warnings=(*first.warnings, *between)), second
-
-
-def _name(experiment: Experiment, frame: Frame) -> str:
-    return f"pair {frame.number}, frame {frame.name}" if experiment.series is None else f"instant {frame.number}"
 
 
 def sampled_light(

@@ -201,7 +201,7 @@ class Instants:
                 log.debug("instants %d and %d are not compared: %s", first.frame.number, second.frame.number, error)
                 return ()
             lights.append(one.light)
-        return compare(self.work.experiment, self.work.cameras, lights[0], lights[1])
+        return compare(self.work.cameras, lights[0], lights[1])
 
     def _stored_light(self, file: VolumeFile) -> FrameLight | None:
         """Return the light that another process stored; None if it did not."""

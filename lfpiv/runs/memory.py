@@ -82,9 +82,9 @@ def _sequence_bytes(experiment: Experiment, pixels: int) -> int:
     These are the instants between the two of a pair, with their images; an instant and all that correct it, with
     splines of their volumes, the later of them with their images twice; and the three volumes of a prediction.
     """
-    if not experiment.in_sequence or experiment.series is None:
+    if not experiment.in_sequence:
         return 0
-    between = experiment.series.step - 1
+    between = experiment.recording.step - 1
     volumes, images = between + 4 * REACH + 5, between + 2 * (REACH + 1)
     return BYTES_PER_VALUE * (volumes * experiment.grid.size + images * pixels)
 

@@ -29,7 +29,7 @@ from lfpiv.reconstruction.sequence import Before
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import belonging, pair_figures
-from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light
+from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light, read_darks
 from lfpiv.runs.instants import Instants, failure
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
@@ -65,8 +65,6 @@ class PairWork:
     """None if all volumes are in the folder."""
     cameras: Mapping[str, CalibratedCamera]
     """Cameras that know what stands still in their images; empty if no image is read."""
-    darks: Mapping[str, np.ndarray | None]
-    """Dark image of every camera [counts]; empty if no image is read."""
     keep_volumes: bool
     """Write the volumes."""
     background: str | None = None
@@ -110,7 +108,7 @@ class PairWork:
 
     def instants(self, stored: Collection[int] = ()) -> Instants | None:
         """Return the instants of a series, of which none is known yet; None for image pairs."""
-        if self.experiment.series is None:
+        if not self.experiment.recording.is_series:
             return None
         return SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
 
@@ -140,6 +138,11 @@ class PairWork:
     def write(self, write: Callable[[], None], *, large: bool = False) -> None:
         """Start to write a result of the present pair. `large` ones are written before the next reconstruction."""
         self.written.append(self.writer.start(write, large=large))
+
+    @cached_property
+    def darks(self) -> Mapping[str, np.ndarray | None]:
+        """Dark image of every camera [counts]."""
+        return read_darks(self.experiment)
 
     @cached_property
     def images(self) -> ReadAhead:
@@ -313,8 +316,7 @@ class PairWork:
 
     def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
         """Log the first warning of each code about a pair or an instant."""
-        found = [warning.of_pair(pair) for warning in warnings]
-        self.log_first(found if self.experiment.series is None else [warning.by_instant() for warning in found])
+        self.log_first([self.experiment.recording.by_result(warning.of_pair(pair)) for warning in warnings])
 
     def measure(
         self,
@@ -426,7 +428,7 @@ class PairWork:
     @cached_property
     def fits(self) -> FrameFits:
         """Particles of the latest frame."""
-        return FrameFits(self.experiment.series is not None)
+        return FrameFits()
 
     @cached_property
     def search(self) -> ParticleSearch:

@@ -179,14 +179,8 @@ class Reconstructor:
             If the images cannot be reconstructed.
         """
         masks = [self.solid(frame) for frame in frames]
-        if self.experiment.series is None:
-            both = self.solver.solve(images, noise, masks=masks).to_dataarrays(self.experiment.grid)
-            return _without_views(both[0]), _without_views(both[1])
-        first, second = (
-            self.solver.smart.solve(one, floor=floor, mask=mask).to_dataarray()
-            for one, floor, mask in zip(images, noise, masks, strict=True)
-        )
-        return _as_written(first, self.experiment.grid), _as_written(second, self.experiment.grid)
+        both = self.solver.solve(images, noise, masks=masks).to_dataarrays(self.experiment.grid)
+        return _without_views(both[0]), _without_views(both[1])
 
     def _frame(self, found: xr.DataArray, light: FrameLight, seconds: float) -> FrameVolume:
         """Return a volume on the voxels of the experiment, with its record."""
@@ -205,8 +199,8 @@ def reconstruction_s(experiment: Experiment, pair: int, volumes: PairVolumes) ->
     all pairs then counts each instant once.
     """
     first, second = (record.seconds for record in volumes.records)
-    series = experiment.series
-    return second if series is not None and pair - series.step in experiment.numbers else first + second
+    chain = experiment.recording.chain
+    return second if chain is not None and pair - chain in experiment.numbers else first + second
 
 
 def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:

@@ -33,7 +33,6 @@ class FrameFits:
     In a series the second frame of a pair is the first one of another pair. So its particles are kept until then.
     """
 
-    in_series: bool
     last: tuple[Frame, Fit] | None = None
     """The latest second frame, and its particles before those of the first frame told them where to look."""
 
@@ -45,7 +44,7 @@ class FrameFits:
                 fits.append(known[1])
             else:
                 fits.append(search.fit(frame.images, volume, noise=frame.noise, clipped=frame.clipped or None))
-        self.last = (light[1].frame, copy.copy(fits[1])) if self.in_series else None
+        self.last = light[1].frame, copy.copy(fits[1])
         return fits
 
 

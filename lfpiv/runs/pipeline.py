@@ -41,14 +41,10 @@ from lfpiv_kernels import runtime
 if TYPE_CHECKING:
     from lfpiv.weights.operator import Weights
 
-PAIRS = "image pairs"
-"""Name of the step that works on pairs, for progress."""
 TRACKS = "tracks"
-"""The same for tracks over a time series."""
+"""Name of the step that makes tracks over a time series, for progress."""
 SIMULATED = "simulated pairs"
 """The same for pairs that are simulated."""
-INSTANTS = "instants"
-"""The same for a time series."""
 
 
 def run(
@@ -280,7 +276,8 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     shared = task.write_task(work, device, used.threads)
     del work, weights  # the workers map them from files; the memory may not have room for both
     tried = _collect(
-        current, dispatch.parallel(shared, current.experiment, todo, workers, current.step(_step_name(current)))
+        current,
+        dispatch.parallel(shared, current.experiment, todo, workers, current.step(current.experiment.recording.work)),
     )
     used = replace(used, peak_memory_mib=tried.peak_memory_mib or None)
     done = Invocation(tried=tried, weights=figures, workers=used)
@@ -304,7 +301,7 @@ def _settle(current: Run, prepared: Prepared, done: Invocation, weights: _Weight
 def _follow(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
     """Make the tracks of a time series; return the invocation, and the weights if they were built for them."""
     lazy = _Lazily(current, prepared, weights)
-    pairs = current.pairs_with_particles() if current.experiment.series is not None else []
+    pairs = current.pairs_with_particles() if current.experiment.recording.is_series else []
     pairs = [pair for pair in pairs if not (figures := current.finished.get(pair)) or figures.verdict not in REFUSED]
     step = current.step(TRACKS)
     tracks.decide(current.experiment, current.folder, current.tracks_stamp, pairs, lazy.work, step)
@@ -355,14 +352,10 @@ def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invoc
     return replace(done, reused=names + more)
 
 
-def _step_name(current: Run) -> str:
-    return PAIRS if current.experiment.series is None else INSTANTS
-
-
 def _sequential(current: Run, work: PairWork, todo: Todo) -> Tried:
     if not todo.ahead():
         return Tried(current.numbers)
-    return _collect(current, dispatch.sequential(work, todo, current.step(_step_name(current))))
+    return _collect(current, dispatch.sequential(work, todo, current.step(current.experiment.recording.work)))
 
 
 def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
@@ -371,5 +364,5 @@ def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
     with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
         for outcome in outcomes:
             current.record(outcome, tried)
-    current.progress(_step_name(current), 1.0)
+    current.progress(current.experiment.recording.work, 1.0)
     return tried

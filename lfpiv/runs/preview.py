@@ -78,7 +78,7 @@ def preview(
         raw: dict[tuple[str, Frame], np.ndarray] = {}
 
         def read(name: str, frame: Frame) -> np.ndarray:
-            raw[name, frame] = current.experiment.particle_image(name, *frame)
+            raw[name, frame] = current.experiment.frame_image(name, frame)
             return raw[name, frame]
 
         light = pair_light(coarse, calibration.cameras, read_darks(coarse), number, read)
@@ -119,7 +119,7 @@ def _reconstruct(
     except ValueError as error:
         raise InputError(f"{coarse.name_of(current.numbers[0])}: {error}") from error
     current.progress("coarse volumes", 1.0)
-    named = {_name(coarse, frame.frame): one for frame, one in zip(light, volumes, strict=True)}
+    named = {frame.frame.within: one for frame, one in zip(light, volumes, strict=True)}
     return named, _refocused(weights, light[0], coarse.grid)
 
 
@@ -154,11 +154,6 @@ def _refocused(weights: Weights, light: FrameLight, grid: Grid) -> dict[str, xr.
     return stacks
 
 
-def _name(experiment: Experiment, frame: Frame) -> str:
-    """Return the name of a frame of a pair, or of an instant."""
-    return f"frame {frame.name}" if experiment.series is None else f"instant {frame.number}"
-
-
 def _level(
     experiment: Experiment,
     light: FrameLight,
@@ -175,7 +170,7 @@ def _level(
     brightest = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).max(axis=(1, 3))
     return Level(
         camera=name,
-        frame=_name(experiment, light.frame),
+        frame=light.frame.within,
         dark=float(np.median(recorded - image)),
         noise=noise,
         peak=peak if np.isfinite(peak) else 0.0,

@@ -23,7 +23,7 @@ from lfpiv.files import MIB, writing
 from lfpiv.records import RecordError, validate
 from lfpiv.results import datasets, provenance, stamps
 from lfpiv.runs import background, belonging, guard, memory, moved_cameras, refinement
-from lfpiv.runs.frame_light import read_darks, sampled_light
+from lfpiv.runs.frame_light import sampled_light
 from lfpiv.runs.invocation import Calibrated, WeightsFigures
 from lfpiv.runs.moved_cameras import SelfCalibrationFigures
 from lfpiv.runs.pair import PairWork
@@ -274,11 +274,11 @@ def pair_work(
     calibration: Calibration | None = None,
     figures: WeightsFigures | None = None,
 ) -> PairWork:
-    """Return the work on pairs. A series takes its cameras from `calibration` if there are no weights.
+    """Return the work on pairs, whose cameras are those of `calibration` if there are no weights.
 
     Without `figures` of the weights, the refusals are those of an earlier invocation.
     """
-    cameras = {} if calibration is None or run.experiment.series is None else calibration.cameras
+    cameras = {} if calibration is None else calibration.cameras
     if weights is not None:
         cameras = weights.cameras
     return PairWork(
@@ -289,7 +289,6 @@ def pair_work(
         refinement=run.refinement_factor,
         weights=weights,
         cameras=cameras,
-        darks=read_darks(run.experiment) if cameras else {},
         keep_volumes=keep_volumes,
         background=run.background,
         vectors=vectors,

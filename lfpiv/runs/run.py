@@ -62,7 +62,7 @@ def open_run(
     start_s = time.perf_counter()
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    folder = Folder(Path(out), experiment.series)
+    folder = Folder(Path(out), experiment.recording)
     numbers = _select(experiment, pairs)
     memory.require(memory.worker_bytes(experiment), experiment, "volumes of")
     made = make_writable(folder.path)
@@ -109,7 +109,7 @@ def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> ran
     start, stop = (None, None) if pairs is None else pairs
     first, after = start or known.start, known.stop if stop is None else stop
     if not known.start <= first < after <= known.stop:
-        numbers = "pairs of the experiment" if experiment.series is None else "instants that have a partner"
+        numbers = "instants that have a partner" if experiment.recording.is_series else "pairs of the experiment"
         raise InputError(
             f"pairs: expected A:B with {known.start} <= A < B <= {known.stop}, the {numbers}, "
             f"found {start or 0}:{'' if stop is None else stop}."
@@ -225,8 +225,7 @@ class Run:
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        series = self.experiment.series
-        step = 1 if series is None or self.experiment.in_sequence else series.step
+        step = 1 if self.experiment.in_sequence else self.experiment.recording.chain or 1
         todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
         todo.quiet = quiet
         return todo

@@ -89,47 +89,45 @@ class SegmentInstants:
     def reach(self, frame: Frame, progress: StepProgress) -> Instant:
         """Reconstruct instants up to `instant` and return it; raise Failure if it failed."""
         if frame.number not in self.ahead:
-            assert self.work.experiment.series is not None
-            series = self.work.experiment.series
-            whole = followed(series, frame.number)
+            frames = self.work.experiment.recording.frames
+            whole = followed(frames, frame.number)
             if self.done is None or self.done >= frame.number:
                 self.done = self.last = whole[0] - 1
                 self.before, self.fingerprints, self.trail, self.beginnings = None, {}, {}, set()
             coming = range(self.done + 1, frame.number + 1)
             for place, number in enumerate(coming):
                 step = part_of(progress, place / len(coming), (place + 1) / len(coming))
-                self._finish(Frame(number, frame.name), corrected_by(series, number), step)
+                self._finish(number, corrected_by(frames, number), step)
         found = self.ahead.pop(frame.number)
         if isinstance(found, Failure):
             raise found.with_traceback(None)
         return found
 
-    def _finish(self, frame: Frame, later: range, progress: StepProgress) -> None:
+    def _finish(self, number: int, later: range, progress: StepProgress) -> None:
         """Finish the next instant, after it and those later ones that correct it were followed."""
-        number = frame.number
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
             if segment_of(one) != self.segment and self.before is not None and self.before.given_up:
                 self.last = one  # no instant of the segment is corrected by it
                 continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
-            self.trail[one] = self._follow(Frame(one, frame.name), step)
+            self.trail[one] = self._follow(one, step)
         self.done = number
         if segment_of(number) == self.segment:  # the others lead into it
             step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
-            self.ahead[number] = self._corrected(frame, step)
+            self.ahead[number] = self._corrected(number, step)
         own = self.trail.get(number)
         if isinstance(own, Followed):
             self.trail[number] = own.finished()
         self.trail = {one: found for one, found in self.trail.items() if one > number - segments.REACH}
 
-    def _follow(self, frame: Frame, progress: StepProgress) -> Followed | Failure:
+    def _follow(self, number: int, progress: StepProgress) -> Followed | Failure:
         """Reconstruct the next instant from the one before. After one that fails, the sequence begins anew."""
-        self.last = frame.number
+        self.last = number
         try:
-            light = self._checked(self.work.light_again(frame))
+            light = self._checked(self.work.light_again(self.work.experiment.recording.frame(number)))
             if self.before is None:
-                self.beginnings.add(frame.number)
+                self.beginnings.add(number)
             found, self.before = self.work.follow(light, self.before, progress)
         except StorageError:
             raise
@@ -137,18 +135,18 @@ class SegmentInstants:
             self.before, self.fingerprints = None, {}
             return failure(error)
         if found.solved.start in (Start.MISSED, Start.UNRESOLVED):
-            self.beginnings.add(frame.number)
+            self.beginnings.add(number)
         self.fingerprints = dict(light.fingerprints)
         return found
 
-    def _corrected(self, frame: Frame, progress: StepProgress) -> Instant | Failure:
+    def _corrected(self, number: int, progress: StepProgress) -> Instant | Failure:
         """Correct an instant by those beside it that show the same particles."""
-        own = self.trail[frame.number]
+        own = self.trail[number]
         if isinstance(own, Failure):
             return own
-        trail, at = self._beside(frame.number)
+        trail, at = self._beside(number)
         try:
-            return Instant(frame, self.work.correct(trail, at, progress), own.light)
+            return Instant(own.light.frame, self.work.correct(trail, at, progress), own.light)
         except StorageError:
             raise
         except Exception as error:  # an error in one instant must not end the series

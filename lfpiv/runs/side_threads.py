@@ -43,13 +43,13 @@ class ReadAhead:
         """Take an image of a camera, which is read now if it was not read before; raise what reading it raised."""
         if (coming := self._coming.get(frame)) is not None and (known := coming.result().pop(camera, None)) is not None:
             return known
-        return self._experiment.particle_image(camera, *frame)
+        return self._experiment.frame_image(camera, frame)
 
     def _read(self, frames: dict[Frame, Future[Images]]) -> None:
         for frame, future in frames.items():
             try:
                 cameras = (camera.name for camera in self._experiment.cameras)
-                future.set_result({name: self._experiment.particle_image(name, *frame) for name in cameras})
+                future.set_result({name: self._experiment.frame_image(name, frame) for name in cameras})
             except BaseException as error:
                 future.set_exception(error)
 

@@ -293,7 +293,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "pairs": experiment.pairs,
             "volume_shape": list(experiment.grid.shape),
             "voxel_mm": experiment.grid.voxel_mm,
-            **({} if experiment.series is None else {"series": experiment.series.model_dump()}),
+            **experiment.recording.stated,
         },
         "settings": {
             name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")
@@ -323,7 +323,7 @@ def _warnings(
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}
-    for warning in found if experiment.series is None else (warning.by_instant() for warning in found):
+    for warning in map(experiment.recording.by_result, found):
         by_sentence.setdefault(warning.sentence, warning)
     return by_sentence
 

@@ -72,12 +72,11 @@ class Task(BaseModel):
             refinement=self.refinement,
             weights=None,
             cameras={},
-            darks={},
             keep_volumes=self.keep_volumes,
             background=self.background,
             refusals=warn.from_text(self.refusals),
             vectors=self.vectors,
-            scratch=None if self.experiment.series is None else shared / INSTANTS,
+            scratch=shared / INSTANTS,
         )
 
 

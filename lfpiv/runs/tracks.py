@@ -15,7 +15,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.names import PARTICLE
 from lfpiv.progress import StepProgress
@@ -52,8 +51,9 @@ def decide(
     `pairs` have linked particles in the folder. `make_work` returns the work on pairs with its weights; it is called
     only if tracks must be made.
     """
-    if experiment.tracking is None or experiment.series is None or len(_instants(experiment, pairs)) < SHORTEST:
-        if experiment.tracking is not None and experiment.series is not None:
+    wanted = experiment.tracking is not None and experiment.recording.is_series
+    if not wanted or len(_instants(experiment, pairs)) < SHORTEST:
+        if wanted:
             log.info("tracks: none of fewer than %d instants", SHORTEST)
         with writing(folder.tracks):
             folder.tracks.unlink(missing_ok=True)
@@ -104,14 +104,13 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
     InputError
         If an image cannot be used, or a table of particles is damaged.
     """
-    experiment, series = work.experiment, work.experiment.series
-    assert series is not None
+    experiment, recording = work.experiment, work.experiment.recording
     search = replace(work.search, sigma_voxel=_size(work, pairs))
     cameras = len(search.weights.cameras)
     instants = _instants(experiment, pairs)
 
     def look(instant: int, positions: np.ndarray, light: np.ndarray) -> FoundParticles:
-        frame = work.light_again(Frame(instant, experiment.frames[0]))
+        frame = work.light_again(recording.frame(instant))
         every = np.repeat(light[:, None], cameras, axis=1)
         cloud = Cloud(positions_mm=positions * experiment.grid.voxel_mm, light=every)
         return search.look(frame.images, cloud, noise=frame.noise, clipped=frame.clipped or None)
@@ -120,13 +119,13 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
         known = set(pairs)
         for number, instant in enumerate(instants):
             progress(number / len(instants))
-            ends = [(instant - frame * series.step, frame) for frame in (0, 1)]
+            ends = [(instant - frame * recording.step, frame) for frame in (0, 1)]
             tables = [(read_particles(work.folder.particles(pair)), frame) for pair, frame in ends if pair in known]
-            yield instant, Candidates.of(tables, series.step)
+            yield instant, Candidates.of(tables, recording.step)
 
     followed = follow(candidates(), look)
-    table = track_table(followed, voxel_mm=experiment.grid.voxel_mm, dt_s=experiment.dt_s / series.step)
-    times = np.array([experiment.instant_s(instant) for instant in table["instant"].values])
+    table = track_table(followed, voxel_mm=experiment.grid.voxel_mm, dt_s=experiment.dt_s / recording.step)
+    times = np.array([recording.time_s(instant, experiment.dt_s) for instant in table["instant"].values])
     progress(1.0)
     about = {"units": "s", "long_name": "time after the first instant of the series"}
     return table.assign(time=(PARTICLE, times, about))

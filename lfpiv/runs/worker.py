@@ -18,7 +18,6 @@ from pathlib import Path
 
 from lfpiv.errors import InputError, StorageError
 from lfpiv.runs import background, memory
-from lfpiv.runs.frame_light import read_darks
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import CORRELATED, Outcome, PairProgress
 from lfpiv.runs.stretches import Stretch
@@ -107,11 +106,10 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{where}: {error}") from None
     work = task.work(shared)
-    if task.weights is not None or work.experiment.series is not None:
-        calibration = load_calibration(work.folder.calibration)
-        if work.background is not None:
-            calibration = background.load(work.folder.background, calibration).seen_by(calibration)
-        work = dataclasses.replace(work, cameras=calibration.cameras, darks=read_darks(work.experiment))
+    calibration = load_calibration(work.folder.calibration)
+    if work.background is not None:
+        calibration = background.load(work.folder.background, calibration).seen_by(calibration)
+    work = dataclasses.replace(work, cameras=calibration.cameras)
     if task.weights is not None:
         work = dataclasses.replace(work, weights=open_weights(shared.parent / WEIGHTS, work.cameras, task.weights))
     _opened.clear()  # the task of an earlier run

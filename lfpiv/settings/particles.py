@@ -11,22 +11,6 @@ from lfpiv.settings.bounds import Count, Name, PathText
 from lfpiv.settings.table import Table
 
 
-class Series(Table):
-    """Instants of a time series, each an image of every camera."""
-
-    instants: Annotated[int, Field(strict=True, ge=2, le=bounds.MOST)]
-    """Number of recorded instants."""
-    first: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] = 0
-    """Number of the first instant."""
-    step: Count = 1
-    """Vectors of instant k are measured from instants k and k + step."""
-
-    @property
-    def numbers(self) -> range:
-        """Numbers of all instants."""
-        return range(self.first, self.first + self.instants)
-
-
 class Particles(Table):
     """Table ``[particles]``: the image pairs, or the time series."""
 
@@ -66,15 +50,3 @@ class Particles(Table):
         if self.instants is not None and self.instants <= self.step:
             raise ValueError("more instants than step")
         return self
-
-    @property
-    def count(self) -> int:
-        """Number of pairs; the last `step` instants of a series are the first of no pair."""
-        return self.pairs if self.pairs is not None else (self.instants or 0) - self.step
-
-    @property
-    def series(self) -> Series | None:
-        """The time series; None for image pairs."""
-        if self.instants is None:
-            return None
-        return Series(instants=self.instants, first=self.first, step=self.step)

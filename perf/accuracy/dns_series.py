@@ -217,7 +217,7 @@ def _measure_way(scene: Scene, experiment: Experiment, out: Path, at: Sequence[n
     """Run the method on the series in one way, and judge vectors and volumes."""
     with counted_reconstructions(len(experiment.cameras)) as counts:
         summary = pipeline.run(experiment, out, keep_volumes=True)
-    folder = Folder(out, experiment.series)
+    folder = Folder(out, experiment.recording)
     fields = ((number, xr.load_dataset(folder.vectors(number), engine="h5netcdf")) for number in experiment.numbers)
     each = [{"instant": number, **judged(scene, number, field)} for number, field in fields]
     volumes = {number: netcdf.read_volume(folder.volume(number, 0)) for number in _used(experiment)}

@@ -24,7 +24,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import metrics
-from lfpiv.experiment.experiment import Frame
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.reconstruction import instant, sequence
 from lfpiv.reconstruction.instant import PreparedInstant
@@ -127,19 +126,19 @@ def series_work(scene: Scene, data: Path) -> Iterator[PairWork]:
 
 def measure(scene: Scene, work: PairWork) -> dict[str, dict[str, float]]:
     """Return error [voxel], lost Q, part within two sigma [%], passes and computing times [s] of both ways."""
-    assert work.experiment.series is not None
-    numbers, name = work.experiment.series.numbers, work.experiment.frames[0]
-    light = {number: work.light_again(Frame(number, name)) for number in numbers}
+    recording = work.experiment.recording
+    numbers = recording.frames
+    light = {number: work.light_again(recording.frame(number)) for number in numbers}
     spent = {way: defaultdict[str, list[float]](list) for way in ("alone", "predicted")}
     passes, volumes = Counter[str](), {way: dict[int, xr.DataArray]() for way in spent}
     with patch.object(PairWork, "light_again", lambda self, frame: light[frame.number]):
         work.reconstructor.instant(light[numbers[0]], ignore_step)  # compiles
-        SegmentInstants(work, 0).reach(Frame(numbers[0], name), ignore_step)  # the same
+        SegmentInstants(work, 0).reach(recording.frame(numbers[0]), ignore_step)  # the same
         predicted = SegmentInstants(work, 0)
         for number in numbers:
             calls: dict[str, Callable[[], Any]] = {
                 "alone": lambda number=number: work.reconstructor.instant(light[number], ignore_step),
-                "predicted": lambda number=number: predicted.reach(Frame(number, name), ignore_step).volume,
+                "predicted": lambda number=number: predicted.reach(recording.frame(number), ignore_step).volume,
             }
             for way, call in calls.items():
                 with timed_parts(spent[way]), dns_series.counted_reconstructions(len(work.cameras)) as counts:

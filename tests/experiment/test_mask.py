@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Frame
 from lfpiv.experiment.mask import read_mask
 from lfpiv.experiment.opening import open_experiment, read_experiment
+from lfpiv.experiment.recording import Recording
 from lfpiv.geometry.grid import Grid
 
 GRID = Grid.from_extent(centre_mm=(0.0, 0.0, 0.1), size_mm=(0.8, 0.6, 0.4), voxel_mm=0.05)  # of `tiny_experiment`
@@ -78,7 +78,7 @@ normal = [-2.0, -1.0, 0.0]
 kind = "box"
 centre_mm = [-0.3, 0.0, 0.1]
 size_mm = [0.2, 0.21, 0.11]"""
-    solid = open_experiment(add(tiny_experiment, text)).solid(Frame(0, "a"))
+    solid = open_experiment(add(tiny_experiment, text)).solid(Recording().frame(0))
     x, y, z = np.moveaxis(places(), -1, 0)
     behind = 2 * (x - 0.21) + y > 0
     inside = (np.abs(x + 0.3) <= 0.1) & (np.abs(y) <= 0.105) & (np.abs(z - 0.1) <= 0.055)
@@ -89,7 +89,7 @@ size_mm = [0.2, 0.21, 0.11]"""
 def test_a_file_and_solids_add_up(tiny_experiment):
     stored(tiny_experiment.parent / "mask.nc", ball, 0.03)
     box = '[[volume.solid]]\nkind = "box"\ncentre_mm = [0.4, 0.3, 0.3]\nsize_mm = [0.2, 0.2, 0.2]'
-    solid = open_experiment(add(tiny_experiment, f'mask = "mask.nc"\n{box}')).solid(Frame(1, "b"))
+    solid = open_experiment(add(tiny_experiment, f'mask = "mask.nc"\n{box}')).solid(Recording().frame(3))
     alone = read_mask(tiny_experiment.parent / "mask.nc", GRID)
     assert solid[alone].all() and solid[-1, -1, -1] and solid.sum() == alone.sum() + 8
 
@@ -172,7 +172,7 @@ def test_each_frame_has_its_own_mask(body):
     experiment = open_experiment(body)
     found = {frame: experiment.solid(frame) for frame in experiment.all_frames()}
     for frame, solid in found.items():
-        file = body.parent / "mask" / f"{frame.number}{frame.name}.nc"
+        file = body.parent / "mask" / "{pair}{frame}.nc".format(**frame.fields)
         np.testing.assert_array_equal(solid, read_mask(file, GRID, may_miss=True))
         assert experiment.mask_files([frame]) == [file]
     assert [bool(solid.any()) for solid in found.values()] == [True, True, True, False]
@@ -251,4 +251,4 @@ def test_values_of_a_frame_are_checked_when_they_are_read(body):
     (mask.astype(np.uint8) * 255 + 255).to_netcdf(file, engine="h5netcdf")
     experiment = read_experiment(body)
     with pytest.raises(InputError, match=r"1b\.nc: .*from 0 to 1"):
-        experiment.solid(Frame(1, "b"))
+        experiment.solid(Recording().frame(3))

@@ -7,8 +7,8 @@ import pytest
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment, read_experiment
+from lfpiv.experiment.recording import Recording
 from lfpiv.results.folder import Folder
-from lfpiv.settings.particles import Series
 
 
 def replace(file, old, new):
@@ -31,7 +31,7 @@ def tiny_series(tiny_experiment):
 
 def test_pairs_of_a_series_have_the_number_of_their_first_instant(tiny_series):
     experiment = open_experiment(tiny_series)
-    assert experiment.series == Series(instants=4, first=7, step=1)
+    assert experiment.recording == Recording.of_series(instants=4, first=7, step=1)
     assert experiment.numbers == range(7, 10) and experiment.pairs == 3
     names = [[image.path.name for image in experiment.pair_images(pair)] for pair in experiment.numbers]
     assert names[0] == ["left_007.tif", "right_007.tif", "left_008.tif", "right_008.tif"]
@@ -47,7 +47,7 @@ def test_step_is_the_distance_of_the_instants_of_a_pair(tiny_series):
 
 
 def test_results_of_a_series_are_named_by_instant():
-    folder = Folder(Path("out"), Series(instants=9, first=3, step=2))
+    folder = Folder(Path("out"), Recording.of_series(instants=9, first=3, step=2))
     assert folder.vectors(4).name == "instant_000004.nc"
     assert folder.volume(4, 1) == folder.volume(6, 0) == Path("out/volumes/instant_000006.nc")
 

@@ -17,6 +17,7 @@ from support import report_run
 
 import lfpiv
 from lfpiv import quantities
+from lfpiv.experiment.recording import Recording
 from lfpiv.geometry.names import COMPONENTS
 from lfpiv.report import calibration, flow, markup, overview, slice_panels, vectors, verdicts, volumes
 from lfpiv.report import pairs as pairs_section
@@ -39,7 +40,6 @@ from lfpiv.report.slice_panels import slice_panel
 from lfpiv.report.summary import CameraFigures, Summary
 from lfpiv.report.svg import cell_edges
 from lfpiv.report.verdicts import Level
-from lfpiv.settings.particles import Series
 
 PLOTLY_BYTES, PAGE_BYTES, CAMERA_BYTES, VECTOR_BYTES = 2.4e6, 1.5e6, 0.7e6, 32
 """Largest size of a report: plotly.js packed (1.9 MB in version 7), pictures and tables, pictures of each camera, and
@@ -150,8 +150,8 @@ def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported,
 
 @pytest.mark.slow
 def test_a_series_is_reported_by_instant(reported, tmp_path):
-    series = Series(instants=report_run.PAIRS + 2, first=0, step=2)
-    experiment = dataclasses.replace(reported.experiment, series=series, pairs=report_run.PAIRS)
+    recording = Recording.of_series(report_run.PAIRS + 2, step=2)
+    experiment = dataclasses.replace(reported.experiment, recording=recording)
     text = reported.write(tmp_path / "report.html", experiment=experiment)
     page = Page(text)
     shown = re.sub(r"<script.*?</script>|<style.*?</style>|<[^>]*>", " ", text, flags=re.DOTALL)

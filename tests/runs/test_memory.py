@@ -11,11 +11,11 @@ from support.ideal_rig import optics, two_cameras
 
 import lfpiv
 from lfpiv.experiment.opening import read_experiment
+from lfpiv.experiment.recording import Recording
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.runs import memory
 from lfpiv.runs.memory import GIB
-from lfpiv.settings.particles import Series
 from lfpiv.weights.forms import shared_profiles
 from lfpiv.weights.forms.shared_profiles import ray_sets
 from lfpiv_kernels import runtime
@@ -81,8 +81,8 @@ def test_a_sequence_holds_the_instants_between_those_of_a_pair(small_run):
     predicting = experiment.smart.model_copy(update={"predict": True})
 
     def needed(step, smart):
-        series = None if step is None else Series(instants=40, step=step)
-        return memory.worker_bytes(dataclasses.replace(experiment, series=series, smart=smart))
+        recording = Recording() if step is None else Recording.of_series(40, step=step)
+        return memory.worker_bytes(dataclasses.replace(experiment, recording=recording, smart=smart))
 
     assert needed(None, predicting) == needed(None, experiment.smart) == needed(8, experiment.smart)
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)

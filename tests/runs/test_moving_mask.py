@@ -16,7 +16,7 @@ def write_masks(experiment, frames):
     for number, frame in enumerate(frames):
         mask = xr.DataArray(np.zeros(grid.shape, bool), grid.coordinates(), ("z", "y", "x"), "mask")
         mask[..., 2 * number : 2 * number + 8] = True
-        path = experiment.path.parent / "mask" / f"{frame.number}{frame.name}.nc"
+        path = experiment.path.parent / "mask" / "{}{}.nc".format(*list(frame.fields.values())[:2])
         path.parent.mkdir(exist_ok=True)
         path.unlink(missing_ok=True)
         mask.to_netcdf(path, engine="h5netcdf")

@@ -208,14 +208,14 @@ def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
     def stamp(experiment):
         return stamps.of_pair(experiment, "calibration", 0).vectors
 
-    made = Marks(**stamp(experiment).attributes)
-    exchanged = dataclasses.replace(experiment, frames=("b", "a"))
+    made, swapped = Marks(**stamp(experiment).attributes), dataclasses.replace(experiment.recording, names=("b", "a"))
+    exchanged = dataclasses.replace(experiment, recording=swapped)
     assert stamp(exchanged).changes(made) == ["particles.frames", "images"]
     file.parent.rename(tmp_path / "elsewhere")  # the images with their experiment: nothing has changed
     there = read_experiment(tmp_path / "elsewhere" / file.name)
     assert stamp(there).changes(made) == []
     shutil.rmtree(tmp_path / "elsewhere" / "particles")  # gone, but stated to be others
-    exchanged = dataclasses.replace(there, frames=("b", "a"))
+    exchanged = dataclasses.replace(there, recording=swapped)
     assert stamp(there).changes(made) == []
     assert stamp(exchanged).changes(made) == ["particles.frames"]
 

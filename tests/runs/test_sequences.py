@@ -18,7 +18,6 @@ from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import dispatch
 from lfpiv.runs.stretches import cut_at_segments
-from lfpiv.settings.particles import Series
 from lfpiv.warn import Code
 
 INSTANTS = 7
@@ -69,7 +68,7 @@ def sequential(work, todo=None):
 def in_segments(work, workers, deaths=None):
     """Do all pairs in stretches of a segment each; return their outcomes by pair, and the client."""
     client, todo = Processes(work, deaths), list(work.experiment.numbers)
-    stretches = cut_at_segments(todo, work.experiment.series.step)
+    stretches = cut_at_segments(todo, work.experiment.recording.step)
     found = dispatch.Dispatch(client, lambda: workers, work.folder.path, stretches, len(todo), "instant")
     return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
 
@@ -110,14 +109,14 @@ def test_stretches_are_segments_and_cover_each_pair_once(chosen, step):
 
 @given(st.integers(0, 100), st.integers(2, 300), st.data())
 def test_an_instant_follows_from_the_beginning_of_its_segment(first, instants, data):
-    series = Series(instants=instants, first=first)
-    instant = data.draw(st.sampled_from(series.numbers))
-    found = segments.followed(series, instant)
+    frames = range(first, first + instants)
+    instant = data.draw(st.sampled_from(frames))
+    found = segments.followed(frames, instant)
     assert found[-1] == instant and found[0] >= first
     begins = instant - instant % segments.SEGMENT
     assert found[0] == max(begins - segments.LEAD_IN, first)
     later = min(instant + segments.REACH, first + instants - 1)
-    assert segments.depended_on(series, instant) == [one for one in range(found[0], later + 1) if one != instant]
+    assert segments.depended_on(frames, instant) == [one for one in range(found[0], later + 1) if one != instant]
 
 
 @pytest.mark.slow

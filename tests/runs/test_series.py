@@ -19,10 +19,10 @@ from xarray.testing import assert_equal
 
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.results import datasets, netcdf, provenance, stamps
+from lfpiv.results import datasets, netcdf, provenance
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume
 from lfpiv.runs import background, dispatch, guard, pipeline, refinement
@@ -45,23 +45,23 @@ def made(small_run, tmp_path_factory):
 @pytest.fixture
 def solved(monkeypatch):
     """Count the reconstructions and the images that are read."""
-    counts, solve, read = Counter(), SmartSolver.solve, Experiment.particle_image
+    counts, solve, read = Counter(), SmartSolver.solve, Experiment.frame_image
 
     def counted_solve(self, *arguments, **settings):
         counts["volumes"] += 1
         return solve(self, *arguments, **settings)
 
-    def counted_read(self, name, number, frame):
+    def counted_read(self, name, frame):
         counts["images"] += 1
-        return read(self, name, number, frame)
+        return read(self, name, frame)
 
     monkeypatch.setattr(SmartSolver, "solve", counted_solve)
-    monkeypatch.setattr(Experiment, "particle_image", counted_read)
+    monkeypatch.setattr(Experiment, "frame_image", counted_read)
     return counts
 
 
 def sequential(work, todo=None):
-    todo = todo or chained(work.experiment.numbers, work.experiment.series.step)
+    todo = todo or chained(work.experiment.numbers, work.experiment.recording.step)
     return list(dispatch.sequential(work, todo, lambda fraction: None))
 
 
@@ -252,7 +252,7 @@ def test_a_new_image_concerns_its_volume_and_two_pairs(made, small_run, tmp_path
     assert [pair for pair in numbers if not after[pair].stamp.fits(made_of[pair])] == [FIRST + 2, FIRST + 3]
     volumes = {one.frame: one.stamp for pair in numbers for one in after[pair].frames}
     changed_frames = [frame for frame, stamp in volumes.items() if not stamp.fits(of_volumes[frame])]
-    assert changed_frames == [Frame(FIRST + 3, "a")]
+    assert changed_frames == [work.experiment.recording.frame(FIRST + 3)]
     step = changed(work, tmp_path / "out", step=2).files(FIRST)
     assert step.frames[0].stamp.hash == after[FIRST].frames[0].stamp.hash, "the step does not change a volume"
     assert step.stamp.hash != after[FIRST].stamp.hash
@@ -295,7 +295,7 @@ def test_standing_light_comes_from_images_of_one_laser(made):
     file, work = made
     experiment = read_experiment(file)
     pairs = background.series(experiment)
-    images = [frame for pair in pairs for frame in stamps.background_frames(experiment, pair)]
+    images = [frame for pair in pairs for frame in experiment.recording.new_frames(pair)]
     assert len(set(images)) == len(images) == len(pairs) == PAIRS, "an image is used twice, or a neighbour of it"
     median = dataclasses.replace(experiment, background="median")
     light = background.estimate(median, work.cameras, pairs, lambda fraction: None).cameras["left"].light

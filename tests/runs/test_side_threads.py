@@ -8,7 +8,7 @@ import pytest
 from support.small_run import PAIRS, damage, same_vectors
 
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.runs import pipeline
@@ -19,14 +19,14 @@ READER, WRITER = "lfpiv images", "lfpiv results"
 
 @pytest.fixture
 def readers(monkeypatch):
-    """Record (pair, frame, thread) of each particle image that is read."""
-    found, inner = [], Experiment.particle_image
+    """Record (frame, thread) of each particle image that is read."""
+    found, inner = [], Experiment.frame_image
 
-    def read(self, name, pair, frame):
-        found.append((pair, frame, threading.current_thread().name))
-        return inner(self, name, pair, frame)
+    def read(self, name, frame):
+        found.append((frame, threading.current_thread().name))
+        return inner(self, name, frame)
 
-    monkeypatch.setattr(Experiment, "particle_image", read)
+    monkeypatch.setattr(Experiment, "frame_image", read)
     return found
 
 
@@ -34,26 +34,25 @@ def test_images_that_come_are_read_by_a_thread_once_and_forgotten(tiny_experimen
     experiment = open_experiment(tiny_experiment)
     expected = {name: experiment.particle_image(name, 1, "a") for name in ("left", "right")}
     readers.clear()
-    images, frame, other = ReadAhead(experiment), Frame(1, "a"), Frame(0, "b")
+    images, (_, other), (frame, second) = ReadAhead(experiment), *map(experiment.pair_frames, (0, 1))
     images.start([frame, other])
     for name, image in expected.items():
         np.testing.assert_array_equal(images.image(name, frame), image)
     assert all(thread == READER for *_, thread in readers)
-    images.start([Frame(1, "b")], present=[frame])
+    images.start([second], present=[frame])
     images.image("left", other)  # it was forgotten
     images.image("left", frame)  # it was taken
-    own = {(pair, name) for pair, name, thread in readers if thread != READER}
-    assert own == {(0, "b"), (1, "a")}
+    assert {one for one, thread in readers if thread != READER} == {other, frame}
 
 
 def test_an_image_that_cannot_be_read_fails_when_it_is_taken(tiny_experiment):
     experiment = open_experiment(tiny_experiment)
     experiment.particle_path("right", 1, "b").unlink()
-    images = ReadAhead(experiment)
-    images.start(experiment.pair_frames(1))
-    assert images.image("left", Frame(1, "a")).ndim == images.image("right", Frame(1, "a")).ndim == 2
+    images, (first, second) = ReadAhead(experiment), experiment.pair_frames(1)
+    images.start([first, second])
+    assert images.image("left", first).ndim == images.image("right", first).ndim == 2
     with pytest.raises(InputError, match="no such file"):
-        images.image("right", Frame(1, "b"))
+        images.image("right", second)
 
 
 def test_results_are_written_in_order_and_errors_belong_to_their_result():
@@ -85,7 +84,7 @@ def test_a_run_reads_ahead_and_writes_behind_with_the_same_results(small_run, tm
     )
     summary = pipeline.run(small_run.experiment, out, keep_volumes=True)
     assert summary["failed"] == [] and same_vectors(small_run.out, out) == PAIRS
-    assert {pair for pair, _, thread in readers if thread == READER} == set(range(1, PAIRS)) and writers == {WRITER}
+    assert {frame.fields["pair"] for frame, thread in readers if thread == READER} == set(range(1, PAIRS)) and writers == {WRITER}
     assert len(list((out / "volumes").iterdir())) == 2 * PAIRS
 
 

@@ -30,13 +30,12 @@ def work(request, tiny_experiment, tmp_path, monkeypatch):
     experiment = read_experiment(tiny_experiment.name)
     return PairWork(
         experiment=experiment,
-        folder=Folder(tmp_path / "out", experiment.series),
+        folder=Folder(tmp_path / "out", experiment.recording),
         calibration_hash="a1",
         guard=((1, 2), (0, 0), (3, 4)),
         refinement=1.25,
         weights=None,
         cameras={},
-        darks={},
         keep_volumes=True,
         background="b2",
     )
@@ -70,7 +69,7 @@ def test_a_worker_reads_the_work_that_the_run_wrote(work, tmp_path, monkeypatch)
         np.testing.assert_array_equal(found.experiment.solid(frame), work.experiment.solid(frame))
     for name in ("folder", "calibration_hash", "guard", "refinement", "keep_volumes", "background", "vectors"):
         assert getattr(found, name) == getattr(work, name), name
-    assert (found.scratch is None) == (work.experiment.series is None)
+    assert found.scratch is not None and found.scratch.parent == shared
     for path in (shared, shared.parent, work.folder.shared):
         assert path.stat().st_mode & 0o777 == 0o700
     assert list(work.folder.shared.iterdir()) == [shared.parent] and shared.parent.parent == work.folder.shared

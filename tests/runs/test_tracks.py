@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Recording
 from lfpiv.results.folder import Folder
 from lfpiv.results.provenance import Stamp
 from lfpiv.runs import tracks
-from lfpiv.settings.particles import Series
 
 PAIRS = [3, 4, 5]
 
@@ -17,8 +16,8 @@ def experiment(*, tracking=True, step=1):
     """Return what is asked of an experiment."""
     return SimpleNamespace(
         tracking=object() if tracking else None,
-        series=Series(instants=6, first=3, step=step),
-        pair_frames=lambda pair: (Frame(pair, "a"), Frame(pair + step, "a")),
+        recording=Recording.of_series(6, 3, step),
+        pair_frames=Recording.of_series(6, 3, step).of_pair,
     )
 
 

@@ -243,7 +243,7 @@ def images_of(path):
 
 def test_series_on_disk_is_an_experiment_with_its_truth(written):
     experiment, scene = open_experiment(written), written_scene()
-    assert experiment.series is not None and experiment.numbers == range(5, 7)
+    assert experiment.recording.is_series and experiment.numbers == range(5, 7)
     names = sorted(path.name for path in (written.parent / "particles" / "one").iterdir())
     assert names == [f"instant_{number:06d}.tif" for number in (5, 6, 7)]
     assert {path.name for path in (written.parent / "background").iterdir()} == {"one.tif", "two.tif"}

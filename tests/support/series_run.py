@@ -8,12 +8,12 @@ import h5py
 from distributed import KilledWorker
 
 from lfpiv.experiment.opening import read_experiment
+from lfpiv.experiment.recording import Recording
 from lfpiv.results.folder import Folder
 from lfpiv.runs import dispatch, guard, refinement
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.stretches import cut
 from lfpiv.runs.worker import Result
-from lfpiv.settings.particles import Series
 from lfpiv.weights.operator import build_weights
 
 FIRST = 3
@@ -55,22 +55,21 @@ def make_work(small_run, file: Path, out: Path) -> PairWork:
         stamp = stored.attrs["settings_hash"]
     return PairWork(
         experiment=experiment,
-        folder=Folder(out, experiment.series),
+        folder=Folder(out, experiment.recording),
         calibration_hash=stamp,
         guard=layers,
         refinement=finer,
         weights=build_weights(calibration, experiment.grid.padded(layers).refined(finer)),
         cameras=calibration.cameras,
-        darks={camera.name: None for camera in experiment.cameras},
         keep_volumes=False,
     )
 
 
 def changed(work: PairWork, out: Path, *, step: int = 1, instants: int = 6, **settings) -> PairWork:
     """Return the work on the first instants, with another step or output folder."""
-    series = Series(instants=instants, first=work.experiment.series.first, step=step)
-    experiment = dataclasses.replace(work.experiment, series=series, pairs=series.instants - step)
-    return dataclasses.replace(work, experiment=experiment, folder=Folder(out, series), **settings)
+    recording = Recording.of_series(instants, work.experiment.recording.first, step)
+    experiment = dataclasses.replace(work.experiment, recording=recording)
+    return dataclasses.replace(work, experiment=experiment, folder=Folder(out, recording), **settings)
 
 
 def chained(pairs, step: int) -> list[int]:
@@ -123,7 +122,7 @@ class Done:
 def in_processes(work: PairWork, workers: int, deaths=None):
     """Do all pairs in stretches for several workers; return their outcomes by pair, and the client."""
     client = Processes(work, deaths)
-    todo = chained(work.experiment.numbers, work.experiment.series.step)
-    stretches = cut(todo, work.experiment.series.step, workers)
+    todo = chained(work.experiment.numbers, work.experiment.recording.step)
+    stretches = cut(todo, work.experiment.recording.step, workers)
     found = dispatch.Dispatch(client, lambda: workers, Path("shared"), stretches, len(todo), "instant")
     return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
