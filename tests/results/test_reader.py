@@ -107,10 +107,11 @@ def test_opening_decodes_one_file_and_reads_the_axes_of_the_others(run, monkeypa
     ],
 )
 def test_pairs_of_other_settings_are_refused_by_both_names(tmp_path, change, words):
-    stamp = '{"calibration": "cafe", "images": [%d]}'  # the images of each pair are its own
+    parts = (f'"{name}": [%(pair)d]' for name in ("images", "images_beside", "mask_files"))  # each pair has its own
+    stamp = f'{{"calibration": "cafe", {", ".join(parts)}}}'
     for number in (0, 1):
-        write_run(tmp_path, (number,), depends_on=stamp % number)
-    write_run(tmp_path, (2,), **{"depends_on": stamp % 2, **change})
+        write_run(tmp_path, (number,), depends_on=stamp % {"pair": number})
+    write_run(tmp_path, (2,), **{"depends_on": stamp % {"pair": 2}, **change})
     with pytest.raises(lfpiv.InputError, match=rf"(?s)pair_0002\.nc.*pair_0000\.nc.*{words}.*lfpiv run"):
         lfpiv.open_results(tmp_path)
     assert lfpiv.open_results(tmp_path, pairs=(0, 2)).sizes["pair"] == 2

@@ -16,7 +16,8 @@ def write_masks(experiment, frames):
     for number, frame in enumerate(frames):
         mask = xr.DataArray(np.zeros(grid.shape, bool), grid.coordinates(), ("z", "y", "x"), "mask")
         mask[..., 2 * number : 2 * number + 8] = True
-        path = experiment.path.parent / "mask" / "{}{}.nc".format(*list(frame.fields.values())[:2])
+        pair, name = (*frame.fields.values(), "a")[:2]
+        path = experiment.path.parent / "mask" / f"{pair}{name}.nc"
         path.parent.mkdir(exist_ok=True)
         path.unlink(missing_ok=True)
         mask.to_netcdf(path, engine="h5netcdf")
