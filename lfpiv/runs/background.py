@@ -19,7 +19,8 @@ import numpy as np
 
 from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.lightfield import background, decorrelation
 from lfpiv.lightfield.background import Series

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Frame
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.lightfield.saturation import saturated_pixels

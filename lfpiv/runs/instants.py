@@ -18,7 +18,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Frame
 from lfpiv.files import replacing, writing
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile

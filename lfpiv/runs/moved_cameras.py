@@ -24,7 +24,8 @@ from lfpiv.warn import Code, Warning, warn
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera, Calibration
-    from lfpiv.experiment.experiment import Experiment, Frame
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.experiment.recording import Frame
     from lfpiv.selfcalibration.movements import Movement, MovementFit
     from lfpiv.weights.operator import Weights
 

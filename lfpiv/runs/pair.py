@@ -22,7 +22,8 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.recording import Frame
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.sequence import Before

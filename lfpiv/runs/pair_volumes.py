@@ -17,7 +17,8 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.recording import Frame
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS

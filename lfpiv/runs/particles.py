@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Frame
 from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.tracking.finding import ParticleSearch

@@ -15,7 +15,8 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, Frame
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
 from lfpiv.lightfield.saturation import saturated_share

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 
 from lfpiv.errors import StorageError
 from lfpiv.experiment import segments
-from lfpiv.experiment.experiment import Frame
+from lfpiv.experiment.recording import Frame
 from lfpiv.experiment.segments import corrected_by, followed, segment_of
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.sequence import Before, Start

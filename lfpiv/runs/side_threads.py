@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from lfpiv.experiment.experiment import Experiment, Frame
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.experiment.recording import Frame
 
 Images = dict[str, np.ndarray]
 """Camera -> image as recorded [counts]."""
