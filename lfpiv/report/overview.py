@@ -103,6 +103,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
         ),
         _recorded(experiment, summary.finished_count),
         ("Joint fit", _joint(summary)),
+        ("Vectors from links", _links(summary)),
         ("Weights", _weights(summary.weights)),
         ("Cameras against each other", _agreement(summary.weights, experiment.noun)),
         ("Damping by ghosts", _damping(summary.damping)),
@@ -152,6 +153,19 @@ def _joint(summary: Summary) -> str:
         share, ratio = np.mean([fit.share for fit in fits]), np.median([fit.misfit_ratio for fit in fits])
         text += f"; {percent(float(share))} of the valid vectors; misfit {ratio:.2f} of that of each frame by itself"
     return text
+
+
+def _links(summary: Summary) -> str:
+    """State how many pairs have vectors from the links of single particles; empty without such pairs."""
+    links = [pair.links for pair in summary.pairs if pair.links is not None]
+    if not links:
+        return ""
+    number, length = np.median([(found.number, found.length) for found in links], axis=0)
+    incompressible = sum(found.form == "incompressible" for found in links)
+    return (
+        f"{markup.count(len(links), 'pair')} of {len(summary.pairs):,}, the others by the correlation; {number:,.0f} "
+        f"links, structures of {length:.1f} voxel (medians), incompressible in {incompressible:,}"
+    )
 
 
 def _weights(weights: WeightFigures) -> str:

@@ -77,6 +77,14 @@ class JointFigures(_Figures):
     share: float = 0.0
 
 
+class LinkFigures(_Figures):
+    """Process through the links of a pair whose means are its vectors."""
+
+    number: int
+    form: str
+    length: float
+
+
 class ParticleFigures(_Figures):
     """Figures of the tracked particles of a pair."""
 
@@ -105,6 +113,7 @@ class PairFigures(_Figures):
     peak_ratio: float | None
     moved_voxel: float | None = None
     joint: JointFigures | None = None
+    links: LinkFigures | None = None
     residual: dict[str, tuple[float, ...]] = {}
     stop: dict[str, str] = {}
     structure: dict[str, dict[str, float]] = {}

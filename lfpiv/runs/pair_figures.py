@@ -5,6 +5,7 @@ The summary of thousands of pairs is built from these figures, without reading t
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -55,6 +56,22 @@ class JointFigures:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LinkFigures:
+    """Process through the links of a pair whose means are its vectors."""
+
+    number: int
+    """Links that count."""
+    form: str
+    """``incompressible``, or ``independent`` components."""
+    length: float
+    """Length of the flow's structures [voxel]."""
+    strength: float
+    """Standard deviation of the displacement about its mean [voxel]."""
+    scatter: float
+    """Standard deviation of what the links do not resolve [voxel]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PairFigures:
     """Figures of the vectors of a pair and of its volumes, in the form of an entry of the summary."""
 
@@ -85,6 +102,8 @@ class PairFigures:
     """Mean displacement of the valid vectors, along x, y, z in each eighth of the volume, 0 where there are none."""
     joint: JointFigures | None = None
     """None without a joint fit."""
+    links: LinkFigures | None = None
+    """None where the vectors do not come from links."""
     residual: Mapping[str, Sequence[float]] | None = None
     """Frame -> residual before each iteration and after the last one."""
     structure: ByFrame | None = None
@@ -181,6 +200,7 @@ def measure(vectors: xr.Dataset, condensed: xr.Dataset | None, warnings: Iterabl
         uncertainty_voxel=_median(vectors["uncertainty"].values[valid]),
         peak_ratio=_median(vectors["peak_ratio"].values[valid]),
         joint=_joint(vectors.attrs) if "estimate" in vectors.attrs else None,
+        links=LinkFigures(**json.loads(vectors.attrs["links"])) if "links" in vectors.attrs else None,
         **known,
     )
 

@@ -446,6 +446,14 @@ def test_tracked_particles_are_tabulated(reported):
     assert pairs_section.particle_table(figures(reported.summary).pairs, "pair") == ""
 
 
+def test_vectors_from_links_are_told(reported):
+    links = {"number": 420, "form": "incompressible", "length": 9.04, "strength": 1.2, "scatter": 0.1}
+    pairs = [pair | {"links": links} for pair in reported.summary["pairs"][:1]] + reported.summary["pairs"][1:]
+    row = overview.run_facts(reported.experiment, figures(reported.summary | {"pairs": pairs}))
+    assert "Vectors from links" in row and "420 links, structures of 9.0 voxel (medians), incompressible in 1" in row
+    assert "Vectors from links" not in overview.run_facts(reported.experiment, figures(reported.summary))
+
+
 def test_the_brightness_outside_the_light_sheet_tells_the_level_of_ghosts(reported, text):
     low, high, ratio = re.search(
         r"lies between z = (\S+) and (\S+) mm; .* is (\S+) times as bright inside as outside", text
