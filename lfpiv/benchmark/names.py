@@ -28,26 +28,24 @@ STANDARD_NAMES = {
 """Names of the CF conventions. There is none for a velocity in any other fluid."""
 
 
-def _along(axis: str) -> dict[str, tuple[str, ...]]:
-    """Return the common names of the quantities along one axis."""
-    u = dict(zip("xyz", "uvw", strict=True))[axis]
-    velocity = (u, f"v{axis}", f"v_{axis}", f"u{axis}", f"velocity_{axis}", f"{axis}_velocity", f"{u}_velocity")
-    displacement = (f"d{axis}", f"displacement_{axis}", f"{axis}_displacement", f"disp_{axis}", f"shift_{axis}")
-    stem = ("uncertainty", "sigma", "std")
-    spread = [f"{one}_{name}" for one in stem for name in (axis, u, f"d{axis}", f"v{axis}")]
-    spread += [f"{u}_{one}" for one in stem]
-    return {
-        axis: (axis, f"{axis}_mm", f"{axis}_m", f"pos_{axis}", f"position_{axis}", f"coord_{axis}"),
-        u: (*velocity, f"vel_{axis}", f"velocity_{u}", f"vel{axis}"),
-        f"d{axis}": (*displacement, f"delta_{axis}", f"delta{axis}"),
-        f"s{axis}": tuple(spread),
+def _along(axis: str, u: str) -> dict[str, tuple[str, ...]]:
+    """Return the common names of the quantities along one axis; `u` is that of the velocity."""
+    velocity = "{u} v{x} v_{x} u{x} velocity_{x} {x}_velocity {u}_velocity vel_{x} velocity_{u} vel{x}"
+    displacement = "d{x} displacement_{x} {x}_displacement disp_{x} shift_{x} delta_{x} delta{x}"
+    spread = [f"{stem}_{name}" for stem in ("uncertainty", "sigma", "std") for name in ("{x}", "{u}", "d{x}", "v{x}")]
+    known = {
+        axis: "{x} {x}_mm {x}_m pos_{x} position_{x} coord_{x}",
+        u: velocity,
+        f"d{axis}": displacement,
+        f"s{axis}": " ".join([*spread, "{u}_uncertainty {u}_sigma {u}_std"]),
     }
+    return {role: tuple(text.format(x=axis, u=u).split()) for role, text in known.items()}
 
 
 COMMON_NAMES: dict[str, tuple[str, ...]] = {
-    **_along("x"),
-    **_along("y"),
-    **_along("z"),
+    **_along("x", "u"),
+    **_along("y", "v"),
+    **_along("z", "w"),
     VALID: ("valid", "isvalid", "is_valid", "chc"),
     NUMBER: ("pair", "instant", "pair_number", "instant_number", "image_pair"),
 }
@@ -95,7 +93,9 @@ def find_names(variables: Mapping[str, Mapping[str, Any]], given: Mapping[str, s
                 )
             found[role] = given[role]
             continue
-        fitting = _fitting(role, variables)
+        standard = STANDARD_NAMES.get(role, ())
+        fitting = [name for name, about in variables.items() if about.get("standard_name") in standard]
+        fitting = fitting or [name for name in variables if name.lower() in COMMON_NAMES[role]]
         if len(fitting) > 1:
             raise InputError(
                 f"{source}: expected one variable for {role}, found {_listed(fitting)}. Choose one by "
@@ -107,15 +107,6 @@ def find_names(variables: Mapping[str, Mapping[str, Any]], given: Mapping[str, s
     if not any(all(role in found for role in roles) for roles in (VELOCITY, DISPLACEMENT)):
         _require(found, DISPLACEMENT if any(role in found for role in DISPLACEMENT) else VELOCITY, variables, source)
     return found
-
-
-def _fitting(role: str, variables: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    standard = STANDARD_NAMES.get(role, ())
-    by_standard = [name for name, about in variables.items() if about.get("standard_name") in standard]
-    if by_standard:
-        return by_standard
-    common = COMMON_NAMES[role]
-    return [name for name in variables if name.lower() in common]
 
 
 def _require(found: Mapping[str, str], roles: Sequence[str], names: Iterable[str], source: str) -> None:

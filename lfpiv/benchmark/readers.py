@@ -30,11 +30,10 @@ VECTORS = "vectors"
 """Folder of vectors in the folder of a run."""
 LONGEST_MM = 1e6
 """Length at which a position or displacement is a mark for a missing value, such as 1e20 or 1e300 [mm]."""
-PARTICLE = "particle"
-"""Name of a dimension over particles."""
+PARTICLE, ROW = "particle", "row"
+"""Names of a dimension over particles, and of one over the rows of a table."""
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")
 _SECONDS = ("reconstruction_s", "correlation_s"), ("seconds",), ("computing_time_s",)
-_MEMORY = ("memory_mib", "peak_memory_mib")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,103 +143,99 @@ class _Columns:
     """Role -> values, shape (vector,)."""
     named: Mapping[str, str]
     """Role -> name."""
-    units: Mapping[str, object]
-    """Name -> unit."""
+    units: Mapping[str, str]
+    """Role -> unit, as far as it is stated."""
     attributes: Mapping[str, Any]
     of_particles: bool
+
+    def stated(self, *names: str) -> np.ndarray | None:
+        """Return the numbers of the first attribute of some names, one or more; None without; refuse others."""
+        name = next((name for name in names if name in self.attributes), None)
+        if name is None:
+            return None
+        try:
+            found = np.ravel(np.asarray(self.attributes[name], float))
+        except (TypeError, ValueError):
+            found = np.empty(0)
+        if not len(found) or not (np.abs(found) < LARGEST_NUMBER).all():
+            value = str(self.attributes[name])[:60]
+            raise InputError(f"{self.path}: expected numbers in the attribute {name!r}, found {value!r}.")
+        return found
 
 
 def _read_file(path: Path, truth: Truth, options: ReadOptions, number: int | None) -> list[MeasuredField]:
     """Return the vectors of a file, one field for each pair in it; `number` is the pair by its name."""
-    columns = _read_table(path, options) if path.suffix.lower() in TABLES else _read_netcdf(path, truth, options)
+    columns = _columns(path, truth, options)
     if names.NUMBER in columns.values:
         of_row = columns.values[names.NUMBER]
         if not np.array_equal(of_row, np.round(of_row)):
             raise InputError(f"{path}: expected whole numbers in {columns.named[names.NUMBER]!r}, found others.")
-        of_row = of_row.astype(int)
     else:
-        of_row = np.full(len(columns.values["x"]), _stated_number(columns, truth, options, number))
+        if options.number is not None:
+            number = options.number
+        elif (stated := columns.stated("pair", "instant")) is not None:
+            number = int(stated[0])
+        if number is None:
+            raise InputError(
+                f"{path}: expected the number of the {truth.noun}, one of {len(truth.numbers)}, found none. State it "
+                "by --number N, in the file's name, or as a variable or attribute `pair`."
+            )
+        of_row = np.full(len(columns.values["x"]), number)
     return [_field(columns, of_row == one, int(one), truth, options) for one in np.unique(of_row)]
-
-
-def _stated_number(columns: _Columns, truth: Truth, options: ReadOptions, number: int | None) -> int:
-    """Return the number of the pair of a file that holds one pair."""
-    if options.number is not None:
-        return options.number
-    for name in ("pair", "instant"):
-        if name in columns.attributes:
-            return int(_stated(columns, name)[0])
-    if number is not None:
-        return number
-    raise InputError(
-        f"{columns.path}: expected the number of the {truth.noun}, one of {len(truth.numbers)}, found none. "
-        "State it by --number N, in the file's name, or as a variable or attribute `pair`."
-    )
 
 
 def _field(columns: _Columns, rows: np.ndarray, number: int, truth: Truth, options: ReadOptions) -> MeasuredField:
     """Return the rows of one pair in millimetres."""
-    stated = {role: values[rows] for role, values in columns.values.items()}
-    voxel_mm, notes = _voxel_mm(columns, truth)
+    edges = columns.stated("voxel_mm")
+    if edges is not None and not (np.allclose(edges, edges[0]) and edges[0] > 0):
+        raise InputError(f"{columns.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
+    voxel_mm = truth.voxel_mm if edges is None else float(edges[0])
 
-    def mm(role: str, dt_s: float | None, voxel: float | None) -> np.ndarray:
-        name = columns.named[role]
-        unit = names.stated_unit(role, name, columns.units.get(name), options.units, str(columns.path))
-        return names.to_mm(stated[role], unit, f"{columns.path}: {name}", dt_s=dt_s, voxel_mm=voxel)
+    def along(roles: Sequence[str], **scale: float) -> np.ndarray | None:
+        if not all(role in columns.values for role in roles):
+            return None
+        values = []
+        for role in roles:
+            name = columns.named[role]
+            unit = names.stated_unit(role, name, columns.units.get(role), options.units, str(columns.path))
+            values.append(names.to_mm(columns.values[role][rows], unit, f"{columns.path}: {name}", **scale))
+        found = np.stack(values, axis=1)
+        return np.where(np.abs(found) < LONGEST_MM, found, np.nan)
 
-    moved = names.VELOCITY if all(role in stated for role in names.VELOCITY) else names.DISPLACEMENT
-
-    def along(roles: Sequence[str], *scale: float | None) -> np.ndarray:
-        values = np.stack([mm(role, *(scale or (None, None))) for role in roles], axis=1)
-        return np.where(np.abs(values) < LONGEST_MM, values, np.nan)
-
-    position = along(names.POSITION)
-    displacement = along(moved, truth.scene.dt_s, voxel_mm)
-    spread = None
-    if all(role in stated for role in names.UNCERTAINTY):
-        spread = along(names.UNCERTAINTY, truth.scene.dt_s, voxel_mm)
-    flag = stated.get(names.VALID)
+    scale = {"dt_s": truth.scene.dt_s, "voxel_mm": voxel_mm}
+    moved = names.VELOCITY if all(role in columns.values for role in names.VELOCITY) else names.DISPLACEMENT
+    position, displacement = along(names.POSITION), along(moved, **scale)
+    assert position is not None and displacement is not None  # `names.find_names` requires them
+    flag = columns.values.get(names.VALID)
     is_particles = options.kind == "particles" or (options.kind == "auto" and columns.of_particles)
     if options.kind == "auto" and not is_particles:
         finite = np.isfinite(position).all(1)
         is_particles = lattice_of(position[finite], truth.voxel_mm) is None and bool(finite.any())
+    memory = columns.stated("memory_mib", "peak_memory_mib")
+    in_voxels = any(columns.units.get(role, "").lower() in names.VOXEL_UNITS for role in moved)
+    note = f"no attribute voxel_mm: voxels are taken to be the data set's, {truth.voxel_mm:g} mm"
     return MeasuredField(
         number=number,
         positions_mm=position,
         displacement_mm=displacement,
-        valid=np.ones(len(position), bool) if flag is None else np.nan_to_num(flag) > 0,
-        uncertainty_mm=spread,
+        valid=np.ones(len(position), bool) if flag is None else np.nan_to_num(flag[rows]) > 0,
+        uncertainty_mm=along(names.UNCERTAINTY, **scale),
         window_mm=None if is_particles else options.window_mm or _window_mm(columns, voxel_mm),
         is_particles=is_particles,
-        seconds=options.seconds if options.seconds is not None else _seconds(columns),
-        memory_mib=next((float(_stated(columns, name)[0]) for name in _MEMORY if name in columns.attributes), None),
-        notes=notes if any(str(unit).lower() in names.VOXEL_UNITS for unit in _used_units(columns, moved)) else (),
+        seconds=_seconds(columns) if options.seconds is None else options.seconds,
+        memory_mib=None if memory is None else float(memory[0]),
+        notes=(note,) if in_voxels and edges is None else (),
     )
-
-
-def _used_units(columns: _Columns, moved: tuple[str, ...]) -> list[object]:
-    return [columns.units.get(columns.named[role]) for role in moved]
-
-
-def _voxel_mm(columns: _Columns, truth: Truth) -> tuple[float, tuple[str, ...]]:
-    """Return the edge of the file's voxel, or that of the data set's with a note."""
-    if "voxel_mm" in columns.attributes:
-        edges = _stated(columns, "voxel_mm")
-        if np.allclose(edges, edges[0]) and edges[0] > 0:
-            return float(edges[0]), ()
-        raise InputError(f"{columns.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
-    return truth.voxel_mm, (f"no attribute voxel_mm: voxels are taken to be the data set's, {truth.voxel_mm:g} mm",)
 
 
 def _window_mm(columns: _Columns, voxel_mm: float) -> Point | None:
     """Return the window that the attributes state, edges (x, y, z)."""
-    for name in ("window_mm", "interrogation_window_mm"):
-        if name in columns.attributes:
-            edges = _stated(columns, name)
-            if len(edges) not in (1, 3) or edges.min() <= 0:
-                raise InputError(f"{columns.path}: expected {name}, one or three lengths > 0, found {edges.tolist()}.")
-            x, y, z = np.broadcast_to(edges, 3)
-            return float(x), float(y), float(z)
+    if (edges := columns.stated("window_mm", "interrogation_window_mm")) is not None:
+        if len(edges) not in (1, 3) or edges.min() <= 0:
+            found = edges.tolist()
+            raise InputError(f"{columns.path}: expected window_mm, one or three lengths > 0, found {found}.")
+        x, y, z = np.broadcast_to(edges, 3).tolist()
+        return x, y, z
     try:
         edges = json.loads(columns.attributes["settings"])["windows"][-1]  # of lfpiv, in voxels (z, y, x)
         z, y, x = (float(voxel_mm * edge) for edge in edges)
@@ -252,20 +247,8 @@ def _window_mm(columns: _Columns, voxel_mm: float) -> Point | None:
 def _seconds(columns: _Columns) -> float | None:
     for group in _SECONDS:
         if all(name in columns.attributes for name in group):
-            return float(sum(_stated(columns, name)[0] for name in group))
+            return float(sum(found[0] for name in group if (found := columns.stated(name)) is not None))
     return None
-
-
-def _stated(columns: _Columns, name: str) -> np.ndarray:
-    """Return the numbers of an attribute, one or more; refuse others."""
-    value = columns.attributes[name]
-    try:
-        found = np.ravel(np.asarray(value, float))
-    except (TypeError, ValueError):
-        found = np.empty(0)
-    if not len(found) or not (np.abs(found) < LARGEST_NUMBER).all():
-        raise InputError(f"{columns.path}: expected numbers in the attribute {name!r}, found {str(value)[:60]!r}.")
-    return found
 
 
 def load_netcdf(path: Path) -> xr.Dataset:
@@ -288,54 +271,8 @@ def load_netcdf(path: Path) -> xr.Dataset:
         raise InputError(f"{path}: expected a NetCDF file, found that it cannot be read ({text}).") from None
 
 
-def _read_netcdf(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
-    """Return the vectors of a NetCDF file, whatever the order of its axes."""
-    dataset = load_netcdf(path)
-    about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
-    for name in set(about) & set(map(str, dataset.coords)):
-        axis = str(about[name].get("axis", "")).lower()
-        if axis in names.POSITION and name.lower() not in names.COMMON_NAMES[axis] and dataset[name].ndim == 1:
-            about[name]["standard_name"] = names.STANDARD_NAMES[axis][0]
-    named = names.find_names(about, options.names, str(path))
-    roles = [role for role in named if role not in (names.NUMBER, names.VALID, *names.UNCERTAINTY)]
-    base = {dim for role in roles for dim in dataset[named[role]].dims}
-    kept = [role for role in named if set(dataset[named[role]].dims) <= base]
-    parts = {role: dataset[named[role]] for role in kept}
-    extra = _pair_dimension(path, dataset, named, base)
-    if extra is not None and names.NUMBER not in parts:
-        count = dataset.sizes[extra]
-        if count > len(truth.numbers):
-            raise InputError(
-                f"{path}: expected at most {len(truth.numbers)} {truth.noun}s along {extra!r}, found {count}."
-            )
-        parts[names.NUMBER] = xr.DataArray(np.array(truth.numbers[:count]), dims=extra)
-        named[names.NUMBER] = extra
-    even = xr.broadcast(*(part.drop_vars(list(part.coords)) for part in parts.values()))
-    units = {name: stated.get("units") for name, stated in about.items()}
-    return _Columns(
-        path=path,
-        values={role: np.asarray(part.values, float).ravel() for role, part in zip(parts, even, strict=True)},
-        named=named,
-        units=units,
-        attributes=dataset.attrs,
-        of_particles=PARTICLE in base,
-    )
-
-
-def _pair_dimension(path: Path, dataset: xr.Dataset, named: Mapping[str, str], base: set[Any]) -> str | None:
-    """Return the dimension over pairs, the one that no position has; None if there is none."""
-    places = {dim for role in names.POSITION for dim in dataset[named[role]].dims}
-    further = sorted(str(dim) for dim in base - places)
-    if len(further) > 1:
-        raise InputError(
-            f"{path}: expected one dimension beside those of x, y and z, over pairs or instants, found "
-            f"{', '.join(further)}. Write one file for each pair."
-        )
-    return further[0] if further else None
-
-
-def _read_table(path: Path, options: ReadOptions) -> _Columns:
-    """Return the vectors of a table as text, whose first line has the titles of its columns."""
+def _load_table(path: Path) -> xr.Dataset:
+    """Read a table as text, whose first line has the titles of its columns, as variables over rows."""
     try:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -354,25 +291,60 @@ def _read_table(path: Path, options: ReadOptions) -> _Columns:
         )  # fmt: skip
     except (ValueError, OSError) as error:
         raise InputError(f"{path}: expected a table of {len(titles)} columns, found otherwise ({error}).") from None
-    about: dict[str, dict[str, Any]] = {}
-    columns = {}
-    for title in titles:
-        name, unit = names.split_title(title)
-        about[name] = {"units": unit}
-        columns[name] = frame[title]
-    named = names.find_names(about, options.names, str(path))
-    values = {}
-    for role, name in named.items():
-        values[role] = pd.to_numeric(columns[name], errors="coerce").to_numpy(float)
-        if np.isnan(values[role]).all() and len(values[role]):
-            raise InputError(f"{path}: expected numbers in the column {name!r}, found {columns[name].iloc[0]!r}.")
     if not len(frame):
         raise InputError(f"{path}: expected rows below the titles, found none.")
+    variables = {}
+    for title in titles:
+        name, unit = names.split_title(title)
+        values = pd.to_numeric(frame[title], errors="coerce").to_numpy(float)
+        about = {"units": unit} if unit else {}
+        if np.isnan(values).all():
+            about["text"] = str(frame[title].iloc[0])
+        variables[name] = (ROW, values, about)
+    return xr.Dataset(variables)
+
+
+def _columns(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
+    """Return the vectors of a file, whatever the order of its axes."""
+    dataset = _load_table(path) if path.suffix.lower() in TABLES else load_netcdf(path)
+    about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
+    for name in set(about) & set(map(str, dataset.coords)):
+        axis = str(about[name].get("axis", "")).lower()
+        if axis in names.POSITION and name.lower() not in names.COMMON_NAMES[axis] and dataset[name].ndim == 1:
+            about[name]["standard_name"] = names.STANDARD_NAMES[axis][0]
+    named = names.find_names(about, options.names, str(path))
+    for name in named.values():
+        if (text := about[name].get("text")) is not None and dataset[name].dims == (ROW,):
+            raise InputError(f"{path}: expected numbers in the column {name!r}, found {text!r}.")
+    roles = [role for role in named if role not in (names.NUMBER, names.VALID, *names.UNCERTAINTY)]
+    base = {dim for role in roles for dim in dataset[named[role]].dims}
+    parts = {role: dataset[name] for role, name in named.items() if set(dataset[name].dims) <= base}
+    extra = _pair_dimension(path, dataset, named, base)
+    if extra is not None and names.NUMBER not in parts:
+        count = dataset.sizes[extra]
+        if count > len(truth.numbers):
+            most = f"{len(truth.numbers)} {truth.noun}s along {extra!r}"
+            raise InputError(f"{path}: expected at most {most}, found {count}.")
+        parts[names.NUMBER] = xr.DataArray(np.array(truth.numbers[:count]), dims=extra)
+        named[names.NUMBER] = extra
+    even = xr.broadcast(*(part.drop_vars(list(part.coords)) for part in parts.values()))
     return _Columns(
         path=path,
-        values=values,
+        values={role: np.asarray(part.values, float).ravel() for role, part in zip(parts, even, strict=True)},
         named=named,
-        units={name: stated["units"] for name, stated in about.items()},
-        attributes={},
-        of_particles=False,
+        units={role: str(about[name]["units"]) for role, name in named.items() if "units" in about.get(name, ())},
+        attributes=dataset.attrs,
+        of_particles=PARTICLE in base,
     )
+
+
+def _pair_dimension(path: Path, dataset: xr.Dataset, named: Mapping[str, str], base: set[Any]) -> str | None:
+    """Return the dimension over pairs, the one that no position has; None if there is none."""
+    places = {dim for role in names.POSITION for dim in dataset[named[role]].dims}
+    further = sorted(str(dim) for dim in base - places)
+    if len(further) > 1:
+        raise InputError(
+            f"{path}: expected one dimension beside those of x, y and z, over pairs or instants, found "
+            f"{', '.join(further)}. Write one file for each pair."
+        )
+    return further[0] if further else None
