@@ -228,8 +228,6 @@ class Recorded:
     """Particles of each frame (n, 3) [mm]."""
     light: tuple[np.ndarray, ...]
     """Light of each particle in each frame, mean of the cameras, relative to the mean."""
-    camera_light: tuple[np.ndarray, ...]
-    """The same for each camera, shape (camera, n)."""
 
 
 @lru_cache(maxsize=16)
@@ -257,7 +255,6 @@ def record(case: Case, folder: Path) -> Recorded:
         images=tuple({key: value.astype(np.float32) for key, value in one.items()} for one in images),
         positions_mm=positions,
         light=tuple(one.mean(0) for one in light),
-        camera_light=light,
     )
 
 

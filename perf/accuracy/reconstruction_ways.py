@@ -162,11 +162,6 @@ def weights_of(rig: Rig, grid: Grid, particle_voxel: float = 0.0) -> Weights:
 _WEIGHTS: dict[Any, Weights] = {}
 
 
-def forget_weights() -> None:
-    """Build weights anew from now on."""
-    _WEIGHTS.clear()
-
-
 def table_of(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return the keys of one table of settings such as "smart.iterations"."""
     return {key.split(".", 1)[1]: value for key, value in settings.items() if key.startswith(name + ".")}
