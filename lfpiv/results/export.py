@@ -327,7 +327,8 @@ def _write_tables(
     described = dict.fromkeys(written, csv_tables.columns_of(results)) | dict.fromkeys(of_particles, columns)
     of_tracks = [target / "tracks.csv"] if Folder(folder).tracks.is_file() else []
     for path in of_tracks:
-        track_files.write_track_csv(track_files.open_tracks(folder), path, csv_tables.DIGITS)
+        rows = track_files.open_tracks(folder).to_dataframe()
+        csv_tables.write_columns(rows, path, track_files.TRACK_UNITS)
         described[path] = {name: {"units": unit} for name, unit in track_files.TRACK_UNITS.items()}
     csv_tables.describe(described, target)
     return written + of_particles + of_tracks
@@ -369,7 +370,8 @@ def _write_particle_csv(tables: dict[int, Path], target: Path) -> list[Path]:
     written = []
     for path in tables.values():
         written.append(target / f"particles_{path.stem}.csv")
-        particles.write_csv(particles.read_particles(path), written[-1], csv_tables.DIGITS)
+        rows = particles.read_particles(path).to_dataframe()
+        csv_tables.write_columns(rows, written[-1], particles.PARTICLE_UNITS)
     return written
 
 

@@ -1,19 +1,21 @@
-"""Write files of ParaView: images of point data on an even grid, and collections of files with their times."""
+"""Write files of ParaView: images of point data on an even grid, points and lines, and collections of files."""
 
 from __future__ import annotations
 
 import math
 import os
 import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import xarray as xr
 from pyevtk.hl import imageToVTK
 from pyevtk.vtk import VtkGroup
 
-from lfpiv.files import state_origin
+from lfpiv.files import replacing, state_origin
 
 
 def write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path: Path) -> None:
@@ -35,6 +37,61 @@ def write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path:
         written = imageToVTK(str(Path(scratch) / "image"), origin=origin, spacing=spacing, pointData=points)
         state_origin(Path(written))
         os.replace(written, path)
+
+
+def write_poly_data(
+    table: xr.Dataset,
+    path: Path,
+    vectors: Mapping[str, Iterable[str]],
+    scalars: Iterable[str],
+    cells: str,
+    ends: np.ndarray,
+) -> None:
+    """Write a table of points (x, y, z) as VTK poly data, as text.
+
+    Parameters
+    ----------
+    table : Dataset
+        Points, one after the other.
+    path : Path
+        The file.
+    vectors : mapping
+        Name of a vector -> names of its components in the table.
+    scalars : iterable of str
+        Further names.
+    cells : {"Verts", "Lines"}
+        What successive points make.
+    ends : ndarray of int
+        End of each cell among the points.
+    """
+    sizes = dict.fromkeys(("Points", "Verts", "Lines", "Strips", "Polys"), 0)
+    sizes |= {"Points": table["x"].size, cells: len(ends)}
+    root = ElementTree.Element("VTKFile", type="PolyData", version="0.1", byte_order="LittleEndian")
+    whole = ElementTree.SubElement(root, "PolyData")
+    piece = ElementTree.SubElement(whole, "Piece", {f"NumberOf{name}": str(size) for name, size in sizes.items()})
+    data = ElementTree.SubElement(piece, "PointData", Vectors=next(iter(vectors)))
+    for name, parts in vectors.items():
+        _add_array(data, name, np.stack([table[part].values for part in parts], axis=1))
+    for name in scalars:
+        _add_array(data, name, table[name].values)
+    points = ElementTree.SubElement(piece, "Points")
+    _add_array(points, "position", np.stack([table[axis].values for axis in "xyz"], axis=1))
+    made = ElementTree.SubElement(piece, cells)
+    _add_array(made, "connectivity", np.arange(table["x"].size))
+    _add_array(made, "offsets", ends)
+    with replacing(path) as scratch:
+        ElementTree.ElementTree(root).write(scratch, encoding="utf-8", xml_declaration=True)
+        state_origin(scratch)
+
+
+def _add_array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
+    """Add an array to an element, as text."""
+    whole = values.dtype.kind in "iub"
+    about = {"type": "Int64" if whole else "Float64", "Name": name, "format": "ascii"}
+    if values.ndim == 2:
+        about["NumberOfComponents"] = str(values.shape[1])
+    text: Sequence[str] = [str(int(v)) if whole else f"{v:.9g}" for v in values.ravel()]
+    ElementTree.SubElement(parent, "DataArray", about).text = " ".join(text)
 
 
 def write_collection(files: dict[Path, float], path: Path) -> None:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import xarray as xr
 
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.files import plain, replacing, state_origin
+from lfpiv.files import plain
 from lfpiv.geometry.names import PARTICLE
-from lfpiv.results import datasets
+from lfpiv.results import datasets, paraview
 from lfpiv.results.stacked_files import NAME
 from lfpiv.version import versions
 
@@ -29,17 +28,6 @@ PARTICLE_UNITS = {
     "valid": "1",
 }
 """Variables of a table of linked particles and their units."""
-
-
-def check_particles(table: xr.Dataset) -> None:
-    """Check the form of a table of linked particles.
-
-    Raises
-    ------
-    ValueError
-        If a variable or a unit is missing or wrong, or a value is not finite.
-    """
-    check_columns(table, PARTICLE_UNITS, "particles")
 
 
 def check_columns(table: xr.Dataset, units: Mapping[str, str], what: str) -> None:
@@ -67,9 +55,9 @@ def write_particles(table: xr.Dataset, path: Path, *, attributes: Mapping[str, A
     Raises
     ------
     ValueError
-        If the table does not have the form that `check_particles` requires.
+        If a variable or a unit is missing or wrong, or a value is not finite.
     """
-    check_particles(table)
+    check_columns(table, PARTICLE_UNITS, "particles")
     path.parent.mkdir(parents=True, exist_ok=True)
     own = {**attributes, "versions": versions(), datasets.FILE: path.name}
     datasets.write_groups({"": datasets.packed(table, own)}, path)
@@ -83,9 +71,14 @@ def read_particles(path: Path) -> xr.Dataset:
     InputError
         If the file is missing, of a newer schema, damaged, or no table of particles.
     """
+    return read_columns(path, PARTICLE_UNITS, "particles")
+
+
+def read_columns(path: Path, units: Mapping[str, str], what: str) -> xr.Dataset:
+    """Read a table into memory, verified; raise InputError if it is damaged or not as `check_columns` wants it."""
     table = datasets.read_group(path)
     try:
-        check_particles(table)
+        check_columns(table, units, what)
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
     return table
@@ -150,62 +143,21 @@ def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) ->
 
 def figures(path: Path) -> dict[str, Any]:
     """Return the figures of a pair's linked particles as entry ``particles`` of the summary; none without a file."""
+    known = stated(path, ("found", "linked", "valid_links", "per_microlens", "explained", "crowding", "sigma_voxel"))
+    return {} if known is None else {"particles": known}
+
+
+def stated(path: Path, names: Sequence[str]) -> dict[str, Any] | None:
+    """Return the attributes of a file that have some names; None without a file."""
     try:
         stored = datasets.read_attributes(path)
     except (FileNotFoundError, DamagedFile):
-        return {}
-    kept = ("found", "linked", "valid_links", "per_microlens", "explained", "crowding", "sigma_voxel")
-    return {"particles": {name: plain(stored[name]) for name in kept if name in stored}}
-
-
-def write_csv(table: xr.Dataset, path: Path, digits: int) -> None:
-    """Write a table of particles as text, a row per particle, units in the header."""
-    write_columns(table, path, PARTICLE_UNITS, digits)
-
-
-def write_columns(table: xr.Dataset, path: Path, units: Mapping[str, str], digits: int) -> None:
-    """Write the variables of a table that have units as text, a row per particle, units in the header."""
-    titles = [name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()]
-    frame = table.assign(valid=table["valid"].astype(np.uint8)).to_dataframe()
-    with replacing(path) as scratch:
-        form = f"%.{digits}g"
-        frame.to_csv(scratch, columns=list(units), header=titles, index=False, float_format=form, encoding="utf-8")
+        return None
+    return {name: plain(stored[name]) for name in names if name in stored}
 
 
 def write_vtp(table: xr.Dataset, path: Path) -> None:
     """Write a table of particles as VTK poly data: a vertex per particle, for ParaView and pyvista."""
-    count = table.sizes[PARTICLE]
-    root = ElementTree.Element("VTKFile", type="PolyData", version="0.1", byte_order="LittleEndian")
-    sizes = {
-        "NumberOfPoints": count,
-        "NumberOfVerts": count,
-        "NumberOfLines": 0,
-        "NumberOfStrips": 0,
-        "NumberOfPolys": 0,
-    }
-    whole = ElementTree.SubElement(root, "PolyData")
-    piece = ElementTree.SubElement(whole, "Piece", {name: str(size) for name, size in sizes.items()})
-    data = ElementTree.SubElement(piece, "PointData", Vectors="velocity")
-    for name, parts in (("velocity", "uvw"), ("displacement", [f"displacement_{axis}" for axis in "xyz"])):
-        add_array(data, name, np.stack([table[part].values for part in parts], axis=1))
-    for name in ("intensity", "residual", "valid", *(f"uncertainty_{axis}" for axis in "xyz")):
-        add_array(data, name, table[name].values)
-    points = ElementTree.SubElement(piece, "Points")
-    add_array(points, "position", np.stack([table[axis].values for axis in "xyz"], axis=1))
-    vertices = ElementTree.SubElement(piece, "Verts")
-    add_array(vertices, "connectivity", np.arange(count, dtype=np.int64))
-    add_array(vertices, "offsets", np.arange(1, count + 1, dtype=np.int64))
-    with replacing(path) as scratch:
-        ElementTree.ElementTree(root).write(scratch, encoding="utf-8", xml_declaration=True)
-        state_origin(scratch)
-
-
-def add_array(parent: ElementTree.Element, name: str, values: np.ndarray) -> None:
-    """Add an array to an element of a VTK file, as text."""
-    whole = values.dtype.kind in "iub"
-    kind = "Int64" if whole else "Float64"
-    about = {"type": kind, "Name": name, "format": "ascii"}
-    if values.ndim == 2:
-        about["NumberOfComponents"] = str(values.shape[1])
-    text: Sequence[str] = [str(int(v)) if whole else f"{v:.9g}" for v in values.ravel()]
-    ElementTree.SubElement(parent, "DataArray", about).text = " ".join(text)
+    vectors = {"velocity": "uvw", "displacement": [f"displacement_{axis}" for axis in "xyz"]}
+    scalars = ("intensity", "residual", "valid", *(f"uncertainty_{axis}" for axis in "xyz"))
+    paraview.write_poly_data(table, path, vectors, scalars, "Verts", np.arange(1, table.sizes[PARTICLE] + 1))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -18,6 +18,9 @@ import xarray as xr
 from lfpiv.files import replacing, write_json
 from lfpiv.geometry.grid import AXES
 from lfpiv.version import SOURCE, history
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 DESCRIPTION = "csv-metadata.json"
 """Name of the description, which readers of "CSV on the Web" look for beside a table."""
@@ -27,14 +30,18 @@ DIGITS = 9
 
 
 def write_vectors(vectors: xr.Dataset, path: Path) -> None:
-    """Write vectors (z, y, x) as text, a row per vector, units in the header, atomically."""
-    columns = columns_of(vectors)
-    flags = {name: vectors[name].astype(np.uint8) for name, item in vectors.data_vars.items() if item.dtype == bool}
-    table = vectors.assign(flags).to_dataframe(dim_order=list(AXES))
-    titles = [title(name, about["units"]) for name, about in columns.items()]
+    """Write vectors (z, y, x) as text, a row per vector, as of `write_columns`."""
+    rows = vectors.to_dataframe(dim_order=list(AXES)).reset_index()
+    write_columns(rows, path, {name: about["units"] for name, about in columns_of(vectors).items()})
+
+
+def write_columns(rows: pd.DataFrame, path: Path, units: Mapping[str, str]) -> None:
+    """Write the columns of a table that have units as text, units in the header, atomically."""
+    rows = rows.astype({name: np.uint8 for name in units if rows[name].dtype == bool})
+    titles = [title(name, unit) for name, unit in units.items()]
     with replacing(path) as scratch:
-        table.reset_index().to_csv(
-            scratch, columns=list(columns), header=titles, index=False, float_format=f"%.{DIGITS}g", encoding="utf-8"
+        rows.to_csv(
+            scratch, columns=list(units), header=titles, index=False, float_format=f"%.{DIGITS}g", encoding="utf-8"
         )
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import lfpiv
 from lfpiv.errors import InputError
-from lfpiv.results import particles
+from lfpiv.results import particles, tables
 from lfpiv.tracking.found import FoundParticles
 
 
@@ -76,7 +76,7 @@ def test_figures_stand_in_the_summary(folder):
 
 def test_text_and_poly_data_hold_the_table(tmp_path):
     wanted = table(0.02)
-    particles.write_csv(wanted, tmp_path / "a.csv", 9)
+    tables.write_columns(wanted.to_dataframe(), tmp_path / "a.csv", particles.PARTICLE_UNITS)
     rows = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(rows) == 5 and np.allclose([float(row["u [m/s]"]) for row in rows], wanted["u"])
     particles.write_vtp(wanted, tmp_path / "a.vtp")

@@ -9,7 +9,7 @@ import xarray as xr
 
 import lfpiv
 from lfpiv.errors import InputError
-from lfpiv.results import track_files
+from lfpiv.results import tables, track_files
 from lfpiv.results.provenance import Stamp
 
 
@@ -56,7 +56,7 @@ def test_damage_and_another_form_are_noticed(folder):
 
 def test_text_and_lines_hold_the_table(tmp_path):
     wanted = table()
-    track_files.write_track_csv(wanted, tmp_path / "a.csv", 9)
+    tables.write_columns(wanted.to_dataframe(), tmp_path / "a.csv", track_files.TRACK_UNITS)
     rows = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(rows) == 10 and np.allclose(
         [float(row["acceleration_x [m/s2]"]) for row in rows], wanted["acceleration_x"]
