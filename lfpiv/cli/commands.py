@@ -128,7 +128,7 @@ def _run(
 
         options: dict[str, Any] = {"pairs": selected, "device": device, "keep_volumes": keep_volumes}
         options |= {"workers": workers, "scheduler": scheduler}
-        summary = unchanged.repeat(unchanged.Command(experiment=str(experiment), **options), out)
+        summary = unchanged.repeat({"experiment": str(experiment), **options}, out)
         if summary is None:
             from lfpiv.runs import pipeline
 

@@ -34,7 +34,6 @@ from lfpiv.runs.pair_vectors import REFUSED
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
 from lfpiv.runs.todo import Todo
-from lfpiv.runs.unchanged import Command
 from lfpiv.runs.worker_plan import Plan
 from lfpiv_kernels import runtime
 
@@ -115,14 +114,8 @@ def run(
         done = _bootstrap(current, prepared, done, weights)
         summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
         if not isinstance(experiment, Experiment):
-            command = Command(
-                experiment=str(experiment),
-                pairs=pairs,
-                device=device,
-                keep_volumes=keep_volumes,
-                workers=workers,
-                scheduler=scheduler,
-            )
+            command = {"experiment": str(experiment), "pairs": pairs, "device": device, "keep_volumes": keep_volumes}
+            command |= {"workers": workers, "scheduler": scheduler}
             unchanged.record(command, current.folder, current.experiment, read, summary)
         return summary
 

@@ -14,7 +14,7 @@ import logging
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,19 +39,6 @@ State = tuple[int, int, int] | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command:
-    """What a run was asked to do."""
-
-    experiment: str
-    """Path of the experiment file as it was given."""
-    pairs: tuple[int, int | None] | None
-    device: str | None
-    keep_volumes: bool
-    workers: int | None
-    scheduler: str | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Record:
     """What is known of a run that finished."""
 
@@ -63,8 +50,10 @@ class _Record:
     """Names of the results."""
 
 
-def repeat(command: Command, out: str | Path) -> dict[str, Any] | None:
+def repeat(command: Mapping[str, Any], out: str | Path) -> dict[str, Any] | None:
     """Return the summary of a finished run if the same command finds nothing changed, None otherwise.
+
+    `command` has the arguments of `lfpiv.runs.pipeline.run`, ``experiment`` as it was given.
 
     Raises
     ------
@@ -79,14 +68,14 @@ def repeat(command: Command, out: str | Path) -> dict[str, Any] | None:
         if len(known.files) > MOST_FILES:
             return None
         with folder.held():
-            if known != _record_of(command, folder, {path: state_of(path) for path in known.files}, known.reused):
+            if known.stamp != _stamp(command, folder, map(state_of, known.files)):
                 return None
             summary = read_object(read_text(folder.summary))
             log.info("nothing changed since the same command finished: results and report are kept")
             summary["reused"] = list(known.reused)
             summary["timings_s"] |= {"total": time.perf_counter() - start}
             written = summary_file.write(summary, folder.summary)
-            _write(_record_of(command, folder, {path: state_of(path) for path in known.files}, known.reused), folder)
+            _write(replace(known, stamp=_stamp(command, folder, map(state_of, known.files))), folder)
             return written
     except (FileNotFoundError, RecordError):
         return None
@@ -103,30 +92,26 @@ def look_at(experiment: Experiment) -> dict[str, State]:
 
 
 def record(
-    command: Command, folder: Folder, experiment: Experiment, read: Mapping[str, State], summary: Mapping[str, Any]
+    command: Mapping[str, Any],
+    folder: Folder,
+    experiment: Experiment,
+    read: Mapping[str, State],
+    summary: Mapping[str, Any],
 ) -> None:
     """Write the record of a run that finished; remove an earlier one if pairs failed or there are too many files.
 
-    Parameters
-    ----------
-    command : Command
-    folder : Folder
-        With all results.
-    experiment : Experiment
-    read : mapping
-        From `look_at`, before the run read anything.
-    summary : mapping
-        What the run returns.
+    `read` is from `look_at` before the run read anything, `summary` what the run returns.
     """
     written = {str(path.absolute()): state_of(path) for path in _written_files(folder)}
     if summary["failed"] or not read or len(read) + len(written) > MOST_FILES:
         with writing(folder.record):
             folder.record.unlink(missing_ok=True)
         return
-    first, after = command.pairs or (0, None)
+    first, after = command["pairs"] or (0, None)
     numbers = [pair for pair in experiment.numbers if first <= pair and (after is None or pair < after)]
     reused = ("calibration", *(f"vectors of {experiment.name_of(pair)}" for pair in numbers))
-    _write(_record_of(command, folder, {**read, **written}, reused), folder)
+    states = {**read, **written}
+    _write(_Record(stamp=_stamp(command, folder, states.values()), files=tuple(states), reused=reused), folder)
 
 
 def state_of(path: str | Path) -> State:
@@ -172,11 +157,10 @@ def _written_files(folder: Folder) -> Iterable[Path]:
     return [*single, *(path for place in places for path in sorted(place.glob("*.nc")))]
 
 
-def _record_of(command: Command, folder: Folder, states: Mapping[str, State], reused: tuple[str, ...]) -> _Record:
-    """Return the record of a run; of a copy of the folder it is another one."""
-    places = os.path.abspath(command.experiment), os.path.abspath(folder.path)
-    known = [asdict(command), places, program(), list(states.items()), reused]
-    return _Record(stamp=digest({"known": files.plain(known)}), files=tuple(states), reused=reused)
+def _stamp(command: Mapping[str, Any], folder: Folder, states: Iterable[State]) -> str:
+    """Return the digest of a command on a folder and of files; of a copy of the folder it is another one."""
+    places = os.path.abspath(command["experiment"]), os.path.abspath(folder.path)
+    return digest({"known": files.plain([command, places, program(), list(states)])})
 
 
 def _write(found: _Record, folder: Folder) -> None:

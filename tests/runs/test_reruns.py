@@ -167,8 +167,7 @@ OPTIONS = {"pairs": (0, None), "device": None, "keep_volumes": True, "workers": 
 
 def repeated(experiment, out, **changed):
     """Return what the same command answers without doing anything; None if it has to check everything."""
-    command = unchanged.Command(experiment=str(experiment), **(OPTIONS | changed))
-    return unchanged.repeat(command, out)
+    return unchanged.repeat({"experiment": str(experiment), **OPTIONS, **changed}, out)
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +245,7 @@ def record_of(experiment, out):
     """Write the record of a finished run."""
     with open_run(experiment, out, None, None) as current:
         summary = json.loads((out / "summary.json").read_text())
-        command = unchanged.Command(experiment=str(experiment), **OPTIONS)
+        command = {"experiment": str(experiment), **OPTIONS}
         unchanged.record(command, current.folder, current.experiment, unchanged.look_at(current.experiment), summary)
 
 
