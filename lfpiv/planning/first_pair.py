@@ -95,8 +95,8 @@ def measure(run: Run, calibration: Calibration, scratch: Path, *, calibrated: bo
 
     def solve() -> tuple[FrameVolume, FrameVolume]:
         if not experiment.recording.is_series:
-            return work.reconstructor.pair(light, number, lambda _: None)
-        found = work.reconstructor.instant(next(coming), lambda _: None)
+            return work.reconstructor.pair(light, lambda _: None)
+        found = work.reconstructor.frame(next(coming), lambda _: None)
         return found, found
 
     (_, first), (volumes, solved) = _timed(solve), _timed(solve)

@@ -115,7 +115,7 @@ class Rig(Shown):
     def _volumes(self, pair: int, progress: StepProgress) -> PairVolumes:
         files = self.work.files(self._known(pair))
         with threadpool_limits(1):
-            return self.work.volumes(files, self.work.instants(), progress)
+            return self.work.volumes(files, self.work.frames(), progress)
 
     def _known(self, pair: int) -> int:
         numbers = self.experiment.numbers

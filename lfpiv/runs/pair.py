@@ -1,8 +1,7 @@
 """The work on pairs: images to volumes to vectors, and files of both.
 
 `PairWork.do` takes a stretch of pairs and yields the `Outcome` of each. Volumes that are in the output folder and still
-fit are read instead of reconstructed. The two frames of an image pair are reconstructed together; the instants of a
-series are each reconstructed once, for both their pairs (`lfpiv.runs.instants`).
+fit are read instead of reconstructed. Each frame is reconstructed once, for all its pairs (`lfpiv.runs.frames`).
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ from lfpiv.reconstruction.sequence import Before
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import belonging, pair_figures
-from lfpiv.runs.frame_light import FrameLight, frame_light, pair_light, read_darks
-from lfpiv.runs.instants import Instants, failure
+from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
+from lfpiv.runs.frames import Frames, JointFrames, failure
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import REFUSED, measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
 from lfpiv.runs.particles import FrameFits, refused, track
-from lfpiv.runs.sequences import SequentialInstants
+from lfpiv.runs.sequences import FollowedFrames
 from lfpiv.runs.side_threads import ReadAhead, Writer
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.link_vectors import vectors_from_links
@@ -81,20 +80,20 @@ class PairWork:
     def do(self, pairs: Iterable[int], progress: PairProgress, *, stored: Collection[int] = ()) -> Iterator[Outcome]:
         """Work on pairs, one after the other; yield the outcome of each.
 
-        An error ends one pair only and is returned as its outcome. `stored` are the instants of a series whose volumes
-        other processes need.
+        An error ends one pair only and is returned as its outcome. `stored` are the frames whose volumes other
+        processes need.
 
         Raises
         ------
         StorageError
             If a result cannot be written; then no other pair could be written either.
         """
-        instants = self.instants(stored)
+        frames = self.frames(stored)
         computed: Computed | None = None
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
                 self._read_ahead(pair, coming)
-                found = self._compute(pair, instants, partial(progress, number))
+                found = self._compute(pair, frames, partial(progress, number))
                 if computed is not None:
                     yield computed.outcome()
                 computed = found
@@ -103,23 +102,22 @@ class PairWork:
         finally:
             self.writer.wait()
             self.images.start(())
-        if instants is not None:
-            instants.clear()
-            self.fits.last = None
+        frames.clear()
+        self.fits.last = None
 
-    def instants(self, stored: Collection[int] = ()) -> Instants | None:
-        """Return the instants of a series, of which none is known yet; None for image pairs."""
-        if not self.experiment.recording.is_series:
-            return None
-        return SequentialInstants(self, stored) if self.experiment.in_sequence else Instants(self, stored)
+    def frames(self, stored: Collection[int] = ()) -> Frames:
+        """Return the frames of pairs to come, of which none is known yet."""
+        if self.experiment.in_sequence:
+            return FollowedFrames(self, stored)
+        return JointFrames(self) if self.experiment.smart.estimate == "joint" else Frames(self, stored)
 
-    def _compute(self, pair: int, instants: Instants | None, progress: StepProgress) -> Computed:
+    def _compute(self, pair: int, frames: Frames, progress: StepProgress) -> Computed:
         """Compute the results of one pair and start to write them."""
         self.written.clear()
         try:
             # sums of BLAS depend on its number of threads; the numbers must not depend on the number of workers
             with threadpool_limits(1):
-                self._do(pair, instants, progress)
+                self._do(pair, frames, progress)
         except StorageError:
             raise
         except Exception as error:  # an error in one pair must not end the others
@@ -188,125 +186,70 @@ class PairWork:
             refinement=self.refinement,
         )
 
-    def _do(self, pair: int, instants: Instants | None, progress: StepProgress) -> None:
+    def _do(self, pair: int, frames: Frames, progress: StepProgress) -> None:
         files = self.files(pair)
         wanted = {"vectors": self.vectors, "volumes": self.keep_volumes, "particles": self.weights is not None}
         if files.outdated(**wanted) is None:
             log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
             return
-        if instants is not None and not self.vectors:
-            instants.keep(files, progress)
-            return
-        volumes = self.volumes(files, instants, part_of(progress, 0.0, RECONSTRUCTED))
+        volumes = self.volumes(files, frames, part_of(progress, 0.0, RECONSTRUCTED if self.vectors else 1.0))
         if self.vectors:
             progress(RECONSTRUCTED)
             self._correlate(files, volumes, progress)
 
-    def volumes(self, files: PairFiles, instants: Instants | None, progress: StepProgress) -> PairVolumes:
-        """Read the volumes of a pair, or reconstruct both together, those of a series each by itself.
-
-        Refusals of the pair go with them.
-
-        Raises
-        ------
-        Failure
-            If an instant of a series failed.
-        InputError
-            If images cannot be used, or two of them are the same.
-        StorageError
-            If a volume cannot be written.
-        """
-        refusals = belonging.of_pair(self.experiment, self.refusals, files.pair)
-        if instants is not None:
-            both = instants.volumes(files, progress)
-            return replace(both, between=(*both.between, *refusals))
-        frames = files.read_volumes()
-        if frames is None:
-            frames = self._reconstruct_pair(files, progress)
-            if self.keep_volumes:
-                for file, found in zip(files.frames, frames, strict=True):
-                    self.write(partial(file.write, found), large=True)
-        return PairVolumes(frames=frames, names=self.experiment.frames, between=refusals)
-
-    def _reconstruct_pair(self, files: PairFiles, progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
-        if self.weights is None:
-            raise InputError(
-                f"{files.frames[0].path}: expected the two volumes of pair {files.pair} made with the present "
-                "settings, found none. Run `lfpiv reconstruct` first."
-            )
-        light = pair_light(self.experiment, self.cameras, self.darks, files.pair, self.images.image)
-        for one in light:
-            self._keep(one)
-        self.writer.wait_large()
-        self._log(files.pair, [warning for frame in light for warning in frame.warnings])
-        return self.reconstructor.pair(light, files.pair, progress)
-
-    def read_light(self, file: VolumeFile) -> FrameLight:
-        """Read and check the images of an instant whose volume is to be reconstructed.
-
-        Raises
-        ------
-        InputError
-            If an image cannot be used, or there are no weights because all volumes should be in the folder.
-        """
-        self.require_weights(file)
-        return self.light_again(file.frame)
+    def volumes(self, files: PairFiles, frames: Frames, progress: StepProgress) -> PairVolumes:
+        """Return the volumes of a pair, with the refusals of the pair; raise as `Frames.volumes`."""
+        both = frames.volumes(files, progress)
+        return replace(both, between=(*both.between, *belonging.of_pair(self.experiment, self.refusals, files.pair)))
 
     def require_weights(self, file: VolumeFile) -> None:
         """Raise InputError if there are no weights because all volumes should be in the folder."""
         if self.weights is None:
             raise InputError(
-                f"{file.path}: expected the volume of instant {file.frame.number} made with the present settings, "
-                "found none. Run `lfpiv reconstruct` first."
+                f"{file.path}: expected the volume of {file.frame.label} made with the present settings, found none. "
+                "Run `lfpiv reconstruct` first."
             )
 
-    def light_again(self, instant: Frame) -> FrameLight:
-        """Read the images of an instant, also if its volume is known; raise InputError if that is not possible."""
+    def light_again(self, frame: Frame) -> FrameLight:
+        """Read the images of a frame, also if its volume is known; raise InputError if that is not possible."""
         if not self.cameras:
-            raise InputError(f"instant {instant.number}: no image is read in this step.")
-        if (known := self.recent.get(instant)) is not None:
+            raise InputError(f"{frame.label}: no image is read in this step.")
+        if (known := self.recent.get(frame)) is not None:
             return known
-        light = frame_light(self.experiment, self.cameras, self.darks, instant, self.images.image)
-        self._keep(light)
+        light = frame_light(self.experiment, self.cameras, self.darks, frame, self.images.image)
+        if self.experiment.tracking is not None:  # particles are found in the two latest frames
+            self.recent[frame] = light
+            for old in list(self.recent)[:-2]:
+                del self.recent[old]
         return light
 
-    def _keep(self, light: FrameLight) -> None:
-        """Keep the light of the two latest frames if particles are to be found in them."""
-        if self.experiment.tracking is not None:
-            self.recent.pop(light.frame, None)
-            self.recent[light.frame] = light
-            for frame in list(self.recent)[:-2]:
-                del self.recent[frame]
-
     def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one instant of a series.
-
-        Raises
-        ------
-        InputError
-            If its images cannot be reconstructed.
-        """
-        self._log(light.frame.number, light.warnings)
+        """Reconstruct one frame by itself; raise InputError if its images cannot be reconstructed."""
         self.writer.wait_large()
-        return self.reconstructor.instant(light, progress)
+        return self.reconstructor.frame(light, progress)
+
+    def reconstruct_pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
+        """Reconstruct both frames of an image pair together; raise InputError if that is not possible."""
+        self.writer.wait_large()
+        return self.reconstructor.pair(light, progress)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct an instant of a series from its predecessor; return it and what its successor needs.
+        """Reconstruct a frame of a series from its predecessor; return it and what its successor needs.
 
         Raises
         ------
         InputError
             If its images cannot be reconstructed.
         """
-        instant = light.frame.number
-        self._log(instant, light.warnings)
+        frame = light.frame.number
+        self.log_warnings(frame, light.warnings)
         self.writer.wait_large()
         found, coming = self.reconstructor.follow(light, before, progress)
-        self._log(instant, found.light.warnings[len(light.warnings) :])
+        self.log_warnings(frame, found.light.warnings[len(light.warnings) :])
         return found, coming
 
     def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one of successive instants again from those before and after it.
+        """Reconstruct one of successive frames again from those before and after it.
 
         Raises
         ------
@@ -315,8 +258,8 @@ class PairWork:
         """
         return self.reconstructor.correct(trail, at, progress)
 
-    def _log(self, pair: int, warnings: Iterable[Warning]) -> None:
-        """Log the first warning of each code about a pair or an instant."""
+    def log_warnings(self, pair: int, warnings: Iterable[Warning]) -> None:
+        """Log the first warning of each code about a pair or its frames."""
         self.log_first([self.experiment.recording.by_result(warning.of_pair(pair)) for warning in warnings])
 
     def measure(
@@ -394,11 +337,11 @@ class PairWork:
             vectors, table, found = self.tracked(files, volumes)
             self._keep_particles(files, table, found)
         figures, write_vectors = self.result(files, vectors, volumes, found)
-        self._log(files.pair, volumes.between)
+        self.log_warnings(files.pair, volumes.between)
         if figures.verdict not in (*REFUSED, Verdict.GOOD.value):
-            self._log(files.pair, [figures.few_valid_warning(files.pair)])
+            self.log_warnings(files.pair, [figures.few_valid_warning(files.pair)])
         if figures.lost_unseeded > 0:
-            self._log(files.pair, [figures.unseeded_warning(files.pair)])
+            self.log_warnings(files.pair, [figures.unseeded_warning(files.pair)])
         progress(CORRELATED)
 
         def write() -> None:
@@ -424,7 +367,7 @@ class PairWork:
             np.mean(table.attrs["per_microlens"]),
             100 * np.mean(table.attrs["explained"]),
         )
-        self._log(files.pair, found)
+        self.log_warnings(files.pair, found)
 
     @cached_property
     def fits(self) -> FrameFits:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from lfpiv.errors import StorageError
 from lfpiv.progress import StepProgress
-from lfpiv.runs.instants import failure
+from lfpiv.runs.frames import failure
 
 RECONSTRUCTED = 0.9
 """Finished fraction of a pair when its volumes are reconstructed, for progress bars."""

@@ -1,4 +1,4 @@
-"""Volumes of a pair or of an instant: reconstruct its images and return them on the voxels of the experiment.
+"""Volumes of frames: reconstruct their images and return them on the voxels of the experiment.
 
 The grid of the weights has guard layers and perhaps finer voxels than the experiment. `Reconstructor` makes the
 solvers for that grid once. It samples each volume on the voxels that are written.
@@ -22,7 +22,7 @@ from lfpiv.experiment.recording import Frame
 from lfpiv.geometry.grid import Grid, Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
-from lfpiv.joint.pair import PairSolver
+from lfpiv.joint.pair import Estimate, PairSolver
 from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.sequence import Before, SequenceSolver, Solved, Start
 from lfpiv.reconstruction.settings import SmartSettings
@@ -39,10 +39,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Followed:
-    """An instant of a sequence that was reconstructed from its images and from the instants before it."""
+    """A frame that was reconstructed from its images and from the frames before it."""
 
     light: FrameLight
-    """Its images, with a warning more if the instant was not where it was predicted."""
+    """Its images, with a warning more if the particles were not where they were predicted."""
     solved: Solved
     seconds: float
     """Time of the reconstruction [s]."""
@@ -100,9 +100,7 @@ class Reconstructor:
         correlation = Correlation(max_displacement_voxel=farthest).model_dump()
         return SequenceSolver(self.solver.smart, correlation)
 
-    def pair(
-        self, light: tuple[FrameLight, FrameLight], pair: int, progress: StepProgress
-    ) -> tuple[FrameVolume, FrameVolume]:
+    def pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
         """Reconstruct both frames of an image pair together.
 
         Raises
@@ -117,26 +115,28 @@ class Reconstructor:
             floors = [frame.noise for frame in light]
             result = solver.solve([frame.images for frame in light], floors, progress, masks=masks)
         except ValueError as error:
-            raise InputError(f"pair {pair}: {error}") from error
+            raise InputError(f"pair {light[0].frame.fields['pair']}: {error}") from error
         volumes = [_without_views(volume) for volume in result.to_dataarrays(self.experiment.grid)]
         seconds = (time.perf_counter() - start) / 2
         first, second = (self._record(volume, frame, seconds) for volume, frame in zip(volumes, light, strict=True))
         return first, second
 
-    def instant(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one instant of a series from its images alone; raise as `pair`."""
-        number, start = light.frame.number, time.perf_counter()
+    def frame(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one frame from its images alone; raise as `pair`."""
+        label, start = light.frame.label, time.perf_counter()
         try:
             mask = self.solid(light.frame)
             found = self.solver.smart.solve(light.images, floor=light.noise, mask=mask, progress=progress)
         except ValueError as error:
-            raise InputError(f"instant {number}: {error}") from error
+            raise InputError(f"{label}: {error}") from error
         seconds = time.perf_counter() - start
-        log.info("instant %d: reconstructed in %.1f s", number, seconds)
-        return self._frame(found.to_dataarray(), light, seconds)
+        level = logging.INFO if self.experiment.recording.is_series else logging.DEBUG
+        log.log(level, "%s: reconstructed in %.1f s", label, seconds)
+        volume = found.to_dataarray().assign_attrs(estimate=Estimate.ALONE.value)
+        return self._frame(volume, light, seconds)
 
     def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct an instant of a series from its predecessor, and return it with what its successor needs.
+        """Reconstruct a frame of a series from its predecessor, and return it with what its successor needs.
 
         Raises
         ------
@@ -148,25 +148,25 @@ class Reconstructor:
             mask = self.solid(light.frame)
             solved = self.sequence.solve(light.images, before, floor=light.noise, mask=mask, progress=progress)
         except ValueError as error:
-            raise InputError(f"instant {number}: {error}") from error
+            raise InputError(f"{light.frame.label}: {error}") from error
         if solved.start is Start.MISSED:
             missed = Warning(code=Code.NOT_FOLLOWED, figures={"ratio": solved.misfit_ratio}, instants=(number,))
             light = replace(light, warnings=(*light.warnings, missed))
         measured = _as_written(solved.found.to_dataarray(), self.experiment.grid)
         seconds = time.perf_counter() - start
-        log.info("instant %d: %s, in %.1f s", number, solved.start.value, seconds)
+        log.info("%s: %s, in %.1f s", light.frame.label, solved.start.value, seconds)
         return Followed(light=light, solved=solved, seconds=seconds), solved.before(measured, before)
 
     def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one of successive instants again from those before and after it; raise as `pair`."""
+        """Reconstruct one of successive frames again from those before and after it; raise as `pair`."""
         own, start = trail[at], time.perf_counter()
-        number = own.light.frame.number
+        label = own.light.frame.label
         try:
             found = self.sequence.correct([one.solved for one in trail], at, progress)
         except ValueError as error:
-            raise InputError(f"instant {number}: {error}") from error
+            raise InputError(f"{label}: {error}") from error
         seconds = own.seconds + time.perf_counter() - start
-        log.info("instant %d: reconstructed in %.1f s with %d instants beside it", number, seconds, len(trail) - 1)
+        log.info("%s: reconstructed in %.1f s with %d instants beside it", label, seconds, len(trail) - 1)
         return self._frame(found.to_dataarray(), own.light, seconds)
 
     def volumes(

@@ -1,6 +1,6 @@
 """Volumes of a time series whose instants are reconstructed one after the other, each from the one before.
 
-`SequentialInstants` goes along the pairs k, k + 1, k + 2, ... of a stretch and holds the instants from the first to the
+`FollowedFrames` goes along the pairs k, k + 1, k + 2, ... of a stretch and holds the instants from the first to the
 second one of the present pair. Each is corrected by the few instants before and after it, so images are read ahead. The
 instants of a segment are always reconstructed from the same beginning
 (`lfpiv.experiment.segments`), so the numbers do not depend on the pairs that are asked for, on the processes, or on
@@ -12,11 +12,11 @@ the segment is reconstructed for it. The next segment tries again.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING
 
-from lfpiv.errors import StorageError
 from lfpiv.experiment import segments
 from lfpiv.experiment.recording import Frame
 from lfpiv.experiment.segments import corrected_by, followed, segment_of
@@ -24,49 +24,61 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.sequence import Before, Start
 from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.runs.instants import Failure, Instant, Instants, InstantWork, failure
+from lfpiv.runs.frames import Failure, Frames, HeldFrame, attempted
 from lfpiv.runs.pair_volumes import Followed
 from lfpiv.warn import Code, Warning
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from lfpiv.runs.pair import PairWork
 
 
 @dataclass(eq=False)
-class SequentialInstants(Instants):
-    """The instants of the present pair of a stretch, and those between them."""
+class FollowedFrames(Frames):
+    """The frames of the present pair of a stretch, and those between them."""
 
-    sequences: dict[int, SegmentInstants] = field(default_factory=dict)
-    """Segment -> its instants so far."""
+    sequences: dict[int, Segment] = field(default_factory=dict)
+    """Number of a segment -> its frames so far."""
 
-    def _obtain(self, files: PairFiles, progress: StepProgress, wanted: Sequence[VolumeFile] | None = None) -> None:
-        for segment in [known for known in self.sequences if known < segment_of(files.pair)]:
-            del self.sequences[segment]
-        for sequence in self.sequences.values():
-            sequence.forget(files.pair)
-        super()._obtain(files, progress, wanted)
-
-    def _needed(self, frame: Frame, files: PairFiles, wanted: Sequence[VolumeFile]) -> bool:
+    def _needed(self, frame: Frame, files: PairFiles) -> bool:
         return frame.number >= files.pair
 
-    def _reconstruct(self, file: VolumeFile, progress: StepProgress) -> Instant:
+    def _obtain(self, file: VolumeFile) -> HeldFrame:
+        if (known := self._known(file)) is not None:
+            return known
         self.work.require_weights(file)
-        segment = segment_of(file.frame.number)
-        if segment not in self.sequences:
-            self.sequences[segment] = SegmentInstants(self.work, segment)
-        return self._handed_on(file, self.sequences[segment].reach(file.frame, progress))
+        return HeldFrame(file.frame)
+
+    def _complete(self, files: PairFiles, progress: StepProgress) -> Sequence[Warning]:
+        """Follow the segments up to both frames, then compare their images."""
+        self.sequences = {known: found for known, found in self.sequences.items() if known >= segment_of(files.pair)}
+        for sequence in self.sequences.values():
+            sequence.forget(files.pair)
+        for number, file in enumerate(files.frames):
+            one = self.held[file.frame]
+            if isinstance(one, HeldFrame) and one.volume is None:
+                step = part_of(progress, number / 2, (number + 1) / 2)
+                self.held[file.frame] = found = attempted(partial(self._reached, file.frame, step))
+                self._hand_on(files, [found] if isinstance(found, HeldFrame) else [])
+        return super()._complete(files, progress)
+
+    def _reached(self, frame: Frame, progress: StepProgress) -> HeldFrame:
+        number = segment_of(frame.number)
+        if number not in self.sequences:
+            self.sequences[number] = Segment(self.work, number)
+        return self.sequences[number].reach(frame, progress)
 
     def clear(self) -> None:
-        """Forget all instants; see `Instants.clear`."""
+        """Forget all frames; see `Frames.clear`."""
         self.sequences.clear()
         super().clear()
 
 
 @dataclass(eq=False)
-class SegmentInstants:
-    """The instants of one segment, as far as they are reconstructed."""
+class Segment:
+    """The frames of one segment, as far as they are reconstructed."""
 
-    work: InstantWork
-    segment: int
+    work: PairWork
+    number: int
     done: int | None = None
     """The last instant that is finished."""
     last: int = -1
@@ -79,14 +91,14 @@ class SegmentInstants:
     """Instants that were followed or failed and that correct others, or will be corrected."""
     beginnings: set[int] = field(default_factory=set)
     """Instants whose particles are not those of the instant before, as far as one knows."""
-    ahead: dict[int, Instant | Failure] = field(default_factory=dict)
+    ahead: dict[int, HeldFrame | Failure] = field(default_factory=dict)
     """Instants that were finished before a pair asked for them."""
 
     def forget(self, first: int) -> None:
         """Forget the instants before one that no pair asks for any more."""
         self.ahead = {number: found for number, found in self.ahead.items() if number >= first}
 
-    def reach(self, frame: Frame, progress: StepProgress) -> Instant:
+    def reach(self, frame: Frame, progress: StepProgress) -> HeldFrame:
         """Reconstruct instants up to `instant` and return it; raise Failure if it failed."""
         if frame.number not in self.ahead:
             frames = self.work.experiment.recording.frames
@@ -107,13 +119,13 @@ class SegmentInstants:
         """Finish the next instant, after it and those later ones that correct it were followed."""
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
-            if segment_of(one) != self.segment and self.before is not None and self.before.given_up:
+            if segment_of(one) != self.number and self.before is not None and self.before.given_up:
                 self.last = one  # no instant of the segment is corrected by it
                 continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
             self.trail[one] = self._follow(one, step)
         self.done = number
-        if segment_of(number) == self.segment:  # the others lead into it
+        if segment_of(number) == self.number:  # the others lead into it
             step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
             self.ahead[number] = self._corrected(number, step)
         own = self.trail.get(number)
@@ -124,33 +136,30 @@ class SegmentInstants:
     def _follow(self, number: int, progress: StepProgress) -> Followed | Failure:
         """Reconstruct the next instant from the one before. After one that fails, the sequence begins anew."""
         self.last = number
-        try:
+
+        def follow() -> Followed:
             light = self._checked(self.work.light_again(self.work.experiment.recording.frame(number)))
             if self.before is None:
                 self.beginnings.add(number)
             found, self.before = self.work.follow(light, self.before, progress)
-        except StorageError:
-            raise
-        except Exception as error:  # an error in one instant must not end the series
+            return found
+
+        found = attempted(follow)
+        if isinstance(found, Failure):
             self.before, self.fingerprints = None, {}
-            return failure(error)
+            return found
         if found.solved.start in (Start.MISSED, Start.UNRESOLVED):
             self.beginnings.add(number)
-        self.fingerprints = dict(light.fingerprints)
+        self.fingerprints = dict(found.light.fingerprints)
         return found
 
-    def _corrected(self, number: int, progress: StepProgress) -> Instant | Failure:
+    def _corrected(self, number: int, progress: StepProgress) -> HeldFrame | Failure:
         """Correct an instant by those beside it that show the same particles."""
         own = self.trail[number]
         if isinstance(own, Failure):
             return own
-        trail, at = self._beside(number)
-        try:
-            return Instant(own.light.frame, self.work.correct(trail, at, progress), own.light)
-        except StorageError:
-            raise
-        except Exception as error:  # an error in one instant must not end the series
-            return failure(error)
+        found = attempted(partial(self.work.correct, *self._beside(number), progress))
+        return found if isinstance(found, Failure) else HeldFrame(own.light.frame, own.light, found)
 
     def _beside(self, number: int) -> tuple[list[Followed], int]:
         """Return an instant with those that correct it, and its index among them."""

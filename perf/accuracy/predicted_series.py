@@ -34,7 +34,7 @@ from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import open_run
-from lfpiv.runs.sequences import SegmentInstants
+from lfpiv.runs.sequences import Segment
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate
@@ -132,12 +132,12 @@ def measure(scene: Scene, work: PairWork) -> dict[str, dict[str, float]]:
     spent = {way: defaultdict[str, list[float]](list) for way in ("alone", "predicted")}
     passes, volumes = Counter[str](), {way: dict[int, xr.DataArray]() for way in spent}
     with patch.object(PairWork, "light_again", lambda self, frame: light[frame.number]):
-        work.reconstructor.instant(light[numbers[0]], ignore_step)  # compiles
-        SegmentInstants(work, 0).reach(recording.frame(numbers[0]), ignore_step)  # the same
-        predicted = SegmentInstants(work, 0)
+        work.reconstructor.frame(light[numbers[0]], ignore_step)  # compiles
+        Segment(work, 0).reach(recording.frame(numbers[0]), ignore_step)  # the same
+        predicted = Segment(work, 0)
         for number in numbers:
             calls: dict[str, Callable[[], Any]] = {
-                "alone": lambda number=number: work.reconstructor.instant(light[number], ignore_step),
+                "alone": lambda number=number: work.reconstructor.frame(light[number], ignore_step),
                 "predicted": lambda number=number: predicted.reach(recording.frame(number), ignore_step).volume,
             }
             for way, call in calls.items():
