@@ -118,29 +118,29 @@ def light_beyond(
     search = _Search.around(grid, calibration)
     group = np.repeat(np.arange(len(pairs)), [len(instants) for instants in pairs])
     views = [_View(camera, search.grid) for camera in calibration.cameras.values()]
-    seen = [view.seen for view in views]
-    light = [
-        [view.light(one[name]) for instants in pairs for one in instants]
-        for name, view in zip(calibration.cameras, views, strict=True)
-    ]
-    fluctuations = [np.stack([*map(view.fluctuation, each)]) for view, each in zip(views, light, strict=True)]
-    profiles = [_profile(fluctuations, seen, search, group, axis) for axis in range(3)]
-    clear = [axis for axis, profile in enumerate(profiles) if profile.is_clear(search.inner(axis))]
-
-    def lit_faces(null: Sequence[np.ndarray]) -> list[FaceLight]:
-        """Return the significant faces, beyond what `null` expects in the layers of each axis."""
-        found = [
-            face
-            for axis in clear
-            for side in (0, 1)
-            if (face := _face(profiles[axis], search, axis, side, null[axis])) is not None
-        ]
-        some = any(significance > SIGNIFICANT for significance, _ in found)
-        return [face for significance, face in found if some and significance > CONFIRMED]
-
-    if not lit_faces([np.zeros((1, n)) for n in search.grid.shape]):
+    images = [one for instants in pairs for one in instants]
+    light = [[view.light(one[name]) for one in images] for name, view in zip(calibration.cameras, views, strict=True)]
+    profiles = _profiles(views, light, search, group)
+    if not _lit_faces(profiles, search, [np.zeros((1, n)) for n in search.grid.shape]):
         return ()
-    return tuple(lit_faces(_null(views, light, search, grid)))
+    return tuple(_lit_faces(profiles, search, _null(views, light, search, grid)))
+
+
+def _profiles(
+    views: Sequence[_View], light: Sequence[Sequence[np.ndarray]], search: _Search, group: np.ndarray
+) -> list[_Profile]:
+    """Return the profile along each axis of the sub-aperture images of all views."""
+    fluctuations = [np.stack([*map(view.fluctuation, each)]) for view, each in zip(views, light, strict=True)]
+    return [_profile(fluctuations, [view.seen for view in views], search, group, axis) for axis in range(3)]
+
+
+def _lit_faces(profiles: Sequence[_Profile], search: _Search, null: Sequence[np.ndarray]) -> list[FaceLight]:
+    """Return the significant faces, beyond what `null` expects in the layers of each axis."""
+    clear = [axis for axis, profile in enumerate(profiles) if profile.is_clear(search.inner(axis))]
+    each = (_face(profiles[axis], search, axis, side, null[axis]) for axis in clear for side in (0, 1))
+    found = [face for face in each if face is not None]
+    some = any(significance > SIGNIFICANT for significance, _ in found)
+    return [face for significance, face in found if some and significance > CONFIRMED]
 
 
 def _null(
@@ -164,10 +164,9 @@ def _null(
     profiles = [list[np.ndarray]() for _ in range(3)]
     for _ in range(DRAWS):
         points = draw(count)
-        fluctuations = [view.fluctuation(view.light_of(points))[None] for view in views]
-        for axis, found in enumerate(profiles):
-            same = _profile(fluctuations, [view.seen for view in views], search, np.zeros(1, int), axis).same
-            found.append(same / same[search.inner(axis)].mean())
+        drawn = _profiles(views, [[view.light_of(points)] for view in views], search, np.zeros(1, int))
+        for axis, (found, profile) in enumerate(zip(profiles, drawn, strict=True)):
+            found.append(profile.same / profile.same[search.inner(axis)].mean())
     return [np.array(found) for found in profiles]
 
 

@@ -211,6 +211,21 @@ def _from_centre_mm(weights: Weights) -> list[tuple[np.ndarray, float]]:
     ]
 
 
+def _sub_apertures(weights: Weights, even: Mapping[str, np.ndarray]) -> dict[str, SubApertures]:
+    """Return the sub-aperture images of each camera, from its image of an evenly lit volume."""
+    return {name: SubApertures(camera, even[name]) for name, camera in weights.cameras.items()}
+
+
+def _random_points(weights: Weights) -> np.ndarray:
+    """Return volumes of single lit voxels at random, shape (draw, voxel)."""
+    inside, random = _inside(weights), np.random.default_rng(0)
+    lit, draws = max(LEAST_LIT, inside.size // SPARSITY), min(math.ceil(KNOWN_VOXELS / inside.size), MOST_DRAWS)
+    volumes = np.zeros((draws, weights.grid.size), np.float32)
+    for points in volumes:
+        points[random.choice(inside, min(lit, inside.size), replace=False)] = 1.0
+    return volumes
+
+
 class ParticleSizer:
     """Estimator of the particles' size and of the scatter of their brightness, for one rig.
 
@@ -227,31 +242,21 @@ class ParticleSizer:
 
     def __init__(self, weights: Weights, even: Mapping[str, np.ndarray] | None = None):
         own = weights(_evenly_lit(weights))
-        self._sub_apertures = {name: SubApertures(camera, own[name]) for name, camera in weights.cameras.items()}
-        known = self._sub_apertures
-        if even is not None:
-            self._sub_apertures = {name: SubApertures(one, even[name]) for name, one in weights.cameras.items()}
-        inside, random = _inside(weights), np.random.default_rng(0)
-        lit, draws = max(LEAST_LIT, inside.size // SPARSITY), min(math.ceil(KNOWN_VOXELS / inside.size), MOST_DRAWS)
-        known_volumes = np.zeros((draws, weights.grid.size), np.float32)
-        for points in known_volumes:
-            points[random.choice(inside, min(lit, inside.size), replace=False)] = 1.0
-        ratios: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
-        equal: dict[str, list[float]] = {name: [] for name in self._sub_apertures}
+        known = _sub_apertures(weights, own)
+        self._sub_apertures = known if even is None else _sub_apertures(weights, even)
+        ratios, self._equal = ({name: list[float]() for name in known} for _ in range(2))
+        some, shape = _random_points(weights), weights.grid.shape
         for width in WIDTHS_VOXEL:
-            sieve, seen = Sieve(width, weights.grid.shape), {name: list[Fluctuations]() for name in known}
-            for points in known_volumes:
-                images = weights(sieve(points).reshape(weights.grid.shape), out=own)
-                for name, sub_apertures in known.items():
-                    seen[name].append(sub_apertures.fluctuations(images[name]))
-            for name, found in seen.items():
-                same, next_lens = np.sum([one.covariances.sum(1) for one in found], axis=0)
+            sieve = Sieve(width, shape)
+            projected = (weights(sieve(points).reshape(shape), out=own) for points in some)
+            drawn = [{name: one.fluctuations(images[name]) for name, one in known.items()} for images in projected]
+            for name in known:
+                same, next_lens = np.sum([one[name].covariances.sum(1) for one in drawn], axis=0)
                 ratios[name].append(next_lens / same if same > 0 else 0.0)
-                equal[name].append(_skewness(np.sum([one.cumulants for one in found], axis=0)))
+                self._equal[name].append(_skewness(np.sum([one[name].cumulants for one in drawn], axis=0)))
         self._ratios = {name: np.maximum.accumulate(values) for name, values in ratios.items()}
-        """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising."""
-        self._equal = equal
-        """`_skewness` of equal particles for each of `WIDTHS_VOXEL`."""
+        """Covariance one lens away over that at the same lens for each of `WIDTHS_VOXEL`, rising. `_equal` is
+        `_skewness` of equal particles for each of them."""
 
     def fluctuations(self, images: Mapping[str, np.ndarray]) -> dict[str, Fluctuations]:
         """Measure what the other methods take, by camera.
