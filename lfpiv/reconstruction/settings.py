@@ -21,7 +21,7 @@ PLAIN: dict[str, Any] = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1,
 
 @dataclass(frozen=True, kw_only=True)
 class SmartSettings:
-    """Settings of SMART; `lfpiv.reconstruct` describes each. The defaults are those of the table ``[smart]``.
+    """Settings of SMART. The defaults are those of the table ``[smart]`` of an experiment file.
 
     Raises
     ------
@@ -30,14 +30,39 @@ class SmartSettings:
     """
 
     iterations: int = DEFAULTS.iterations
+    """Largest number of iterations, >= 0."""
     relaxation: float = DEFAULTS.relaxation
+    """Relaxation parameter mu, > 0; 1 is safe, 3 diverges."""
     floor_share: float = DEFAULTS.floor_share
+    """Least floor as a share of each image's brightness, sum I^2 / sum I, hot pixels left out. Particles smaller than a
+    voxel light fewer pixels than the voxel; the floor keeps the dark pixels beside them from counting against it. 0
+    takes `floor` as it is."""
     intensity_cap: float | str = DEFAULTS.intensity_cap
+    """Upper limit of the counts as a multiple of the typical peak, the median over the lit microimages of each one's
+    brightest pixel; 0 for none. It makes particles of unlike brightness more alike between cameras and frames
+    (`lfpiv.reconstruction.intensity_cap`). "auto": none if the images show equally bright particles
+    (`lfpiv.reconstruction.particle_size`); otherwise 1 for particles that ``sieve_voxel = "auto"`` finds smaller than
+    voxels, and 2 for larger ones."""
     normalisation: str = DEFAULTS.normalisation
+    """Which of the two iterations that `lfpiv.reconstruct` states: "column" or "paper"."""
     accelerate: bool = DEFAULTS.accelerate
+    """False iterates without momentum, as those formulas do. Then, without sieve and tolerance, 5 iterations and 7
+    more with the first volume as its `first` equal 12 exactly. Momentum starts anew with every call."""
     sieve_voxel: float | str = DEFAULTS.sieve_voxel
+    """Standard deviation [voxel] of a sieve: the volume is a sum of Gaussians of this size, E = G c, and SMART iterates
+    their brightnesses c with w G in place of w (`lfpiv.reconstruction.steps`). 0 for none. "auto": matched to the size
+    of the particles, which is measured in the images (`lfpiv.reconstruction.particle_size`); none for particles smaller
+    than voxels."""
     tolerance: float = DEFAULTS.tolerance
+    """Stop when the misfit falls by less than this fraction in an iteration; 0 runs all iterations."""
     subsets: int | str = DEFAULTS.subsets
+    """Number of ordered subsets of the rays, each of which makes a step (`lfpiv.reconstruction.ordered_subsets`): 1
+    for SMART over all rays, or more. Where planes of voxels share profiles (`lfpiv.weights.forms.shared_profiles`) a
+    subset is some rows of pixels under the lenses of all cameras, and there are up to 16, by default as many as
+    possible, until they contradict each other or have made 128 steps. Otherwise it is a camera or half of its lenses:
+    "auto" takes halves of one or two cameras, until they contradict each other, then whole cameras, as for more of
+    them. An iteration is a pass over all subsets; the last two iterations, at most half of them, are SMART's own.
+    "auto" is 1 without `accelerate`, or with "paper"."""
 
     @property
     def allows_subsets(self) -> bool:
