@@ -298,7 +298,7 @@ def smart(matrix, image, volume, *, iterations, relaxation=1.0, floor=0.0, paper
     return volume
 
 
-def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shortening, momentum, leap):
+def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shortening, momentum, extrapolation):
     """Return SMART's volume after epochs over subsets with momentum, each subset a dense matrix (pixel, voxel).
 
     Parameters
@@ -311,7 +311,7 @@ def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shor
         Sum of each voxel's weights over all pixels, those of no subset included.
     epochs : int
         Passes over all subsets.
-    floor, shortening, momentum, leap : float
+    floor, shortening, momentum, extrapolation : float
         Noise floor, `SHORTENING`, momentum's largest exponent, largest ratio of two iterates that it repeats.
     """
     ahead = last = volume
@@ -322,7 +322,7 @@ def ordered_subsets(matrices, images, volume, *, column_sum, epochs, floor, shor
             step = 1 / np.maximum(matrix.sum(0), column_sum / len(matrices)) / (1 + shortening * epoch)
             following = ahead * np.exp(step * exponent)
             later = (1 + np.sqrt(1 + 4 * time**2)) / 2
-            ratio = np.clip(following / last, 1 / leap, leap)
+            ratio = np.clip(following / last, 1 / extrapolation, extrapolation)
             ahead, last = following * ratio ** min((time - 1) / later, momentum), following
             time = later
     return ahead

@@ -79,10 +79,10 @@ class LightSteps:
         if self.model.rho is not None:
             self._step_loss(light, logs[1] - logs[0])
         mean = to_device(np.ascontiguousarray((logs[0] + logs[1]) / 2).reshape(-1), float)
-        leap = momentum.leap(ahead)
+        extrapolation = momentum.extrapolation(ahead)
         stepped = momentum.previous
-        sharpen(ahead, mean, mean, 0.0, LARGEST_STEP, leap=leap, stepped=stepped)
-        return leap.ahead, momentum.after(stepped)
+        sharpen(ahead, mean, mean, 0.0, LARGEST_STEP, extrapolation=extrapolation, stepped=stepped)
+        return extrapolation.ahead, momentum.after(stepped)
 
     def _logarithm(self, frame: int, light: np.ndarray, transport: Transport, number: int, length: float) -> np.ndarray:
         """Return the logarithm of a frame's own step by one subset, sharpened, shape (z, y, x), float32."""

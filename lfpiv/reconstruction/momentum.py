@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv_kernels.reconstruction.update import Leap
+from lfpiv_kernels.reconstruction.update import Extrapolation
 from lfpiv_kernels.transfer import DeviceArray
 
 MOMENTUM = 0.9
@@ -39,9 +39,9 @@ class Momentum:
         """Exponent beta of the next extrapolation; 0 when the momentum starts."""
         return min((self.time - 1) / self.following_time, self.largest)
 
-    def leap(self, ahead: DeviceArray) -> Leap:
+    def extrapolation(self, ahead: DeviceArray) -> Extrapolation:
         """Return what a step needs to extrapolate its coefficients into `ahead`."""
-        return Leap(self.previous, self.exponent, ahead)
+        return Extrapolation(self.previous, self.exponent, ahead)
 
     def after(self, coefficients: DeviceArray) -> Momentum:
         """Return the momentum after a step to `coefficients`."""

@@ -25,7 +25,7 @@ from typing import Protocol
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve
 from lfpiv_kernels.filters.blur import GaussianBlur
-from lfpiv_kernels.reconstruction.update import Leap, sharpen, update
+from lfpiv_kernels.reconstruction.update import Extrapolation, sharpen, update
 from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, empty
 
@@ -86,9 +86,11 @@ class SmartStep:
         in_place: bool = False,
     ) -> tuple[DeviceArray, Momentum | None]:
         """Return the next coefficients and the momentum after them."""
-        stepped, leap = _targets(coefficients, momentum, in_place)
-        update(coefficients, self.sieve(exponent), self.size, length=length, leap=leap, stepped=stepped)
-        return _followed(stepped, leap, momentum)
+        stepped, extrapolation = _targets(coefficients, momentum, in_place)
+        update(
+            coefficients, self.sieve(exponent), self.size, length=length, extrapolation=extrapolation, stepped=stepped
+        )
+        return _followed(stepped, extrapolation, momentum)
 
 
 @dataclass(frozen=True)
@@ -112,9 +114,11 @@ class SharpenedStep:
         logarithm = multiply(exponent, self.size, exponent if in_place else None, factor=length)
         blurred = self._blur(logarithm)
         logarithm = self._narrow(logarithm)
-        stepped, leap = _targets(coefficients, momentum, in_place)
-        sharpen(coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, leap=leap, stepped=stepped)
-        return _followed(stepped, leap, momentum)
+        stepped, extrapolation = _targets(coefficients, momentum, in_place)
+        sharpen(
+            coefficients, logarithm, blurred, SHARPENING, LARGEST_STEP, extrapolation=extrapolation, stepped=stepped
+        )
+        return _followed(stepped, extrapolation, momentum)
 
     @cached_property
     def _blur(self) -> GaussianBlur:
@@ -126,19 +130,21 @@ class SharpenedStep:
         return GaussianBlur(width, self.sieve.shape, truncate=TRUNCATE, border="nearest")
 
 
-def _targets(coefficients: DeviceArray, momentum: Momentum | None, in_place: bool) -> tuple[DeviceArray, Leap | None]:
+def _targets(
+    coefficients: DeviceArray, momentum: Momentum | None, in_place: bool
+) -> tuple[DeviceArray, Extrapolation | None]:
     """Return where the coefficients after a step go, and those that momentum extrapolates from them."""
     if momentum is None:
         return coefficients if in_place else empty(coefficients.size), None
     if in_place:
-        return momentum.previous, momentum.leap(coefficients)
-    return empty(coefficients.size), momentum.leap(empty(coefficients.size))
+        return momentum.previous, momentum.extrapolation(coefficients)
+    return empty(coefficients.size), momentum.extrapolation(empty(coefficients.size))
 
 
 def _followed(
-    stepped: DeviceArray, leap: Leap | None, momentum: Momentum | None
+    stepped: DeviceArray, extrapolation: Extrapolation | None, momentum: Momentum | None
 ) -> tuple[DeviceArray, Momentum | None]:
     """Return the next coefficients and the momentum after a step."""
-    if momentum is None or leap is None:
+    if momentum is None or extrapolation is None:
         return stepped, None
-    return leap.ahead, momentum.after(stepped)
+    return extrapolation.ahead, momentum.after(stepped)

@@ -95,7 +95,7 @@ def _sharpen(
 
 
 @dataclass(frozen=True)
-class Leap:
+class Extrapolation:
     """Momentum after a step: `ahead` becomes volume * (volume / last)^exponent.
 
     Zeros of `last` stay zero in `ahead`. Elsewhere `volume` and `ahead` become at least `SMALLEST`.
@@ -107,6 +107,10 @@ class Leap:
     """At most `LARGEST_MOMENTUM`."""
     ahead: wp.array
     """Where to write; it may be the memory of `last` or of what the step starts from."""
+
+
+NO_EXTRAPOLATION = Extrapolation(None, 0.0, None)
+"""Of a step without momentum."""
 
 
 class Comparison:
@@ -176,7 +180,7 @@ def update(
     step: wp.array,
     *,
     length: float = 1.0,
-    leap: Leap | None = None,
+    extrapolation: Extrapolation | None = None,
     stepped: wp.array,
 ) -> None:
     """Write volume * exp(step * exponent * length) to `stepped`; float32, shape (voxel,).
@@ -187,12 +191,13 @@ def update(
         On the device.
     length : float
         Factor of all exponents.
-    leap : Leap, optional
+    extrapolation : Extrapolation, optional
         Momentum that goes on from the step.
     stepped : array
         Where to write. It may be any of the other arrays.
     """
-    last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
+    to = extrapolation or NO_EXTRAPOLATION
+    last, momentum, ahead = to.last, to.exponent, to.ahead
     sweep_runs(_update, [volume, exponent, step, float(length), last, float(momentum)], [stepped, ahead])
 
 
@@ -203,13 +208,14 @@ def sharpen(
     share: float,
     largest: float,
     *,
-    leap: Leap | None = None,
+    extrapolation: Extrapolation | None = None,
     stepped: wp.array,
 ) -> None:
     """Write volume * exp(logarithm + share * (logarithm - blurred)) to `stepped`; float32, shape (voxel,).
 
     The absolute exponent is at most `largest`, and at most `LARGEST_EXPONENT`. The other arguments are as of `update`.
     """
-    last, momentum, ahead = (None, 0.0, None) if leap is None else (leap.last, leap.exponent, leap.ahead)
+    to = extrapolation or NO_EXTRAPOLATION
+    last, momentum, ahead = to.last, to.exponent, to.ahead
     inputs = [volume, logarithm, blurred, float(share), float(largest), last, float(momentum)]
     sweep_runs(_sharpen, inputs, [stepped, ahead])

@@ -115,18 +115,22 @@ def test_steps_with_momentum_equal_their_twin(volumes, momentum, in_place):
     for expected, is_sharp in ((smart, False), (sharp, True)):
         volume, memory = to_device(dark.copy()), to_device(last.copy())
         stepped = memory if in_place and momentum else volume if in_place else empty(dark.size)
-        leap = update.Leap(memory, beta, volume if in_place else empty(dark.size)) if momentum else None
-        keywords = {"leap": leap, "stepped": stepped}
+        extrapolation = (
+            update.Extrapolation(memory, beta, volume if in_place else empty(dark.size)) if momentum else None
+        )
+        keywords = {"extrapolation": extrapolation, "stepped": stepped}
         if is_sharp:
             update.sharpen(volume, to_device(signed), to_device(0.5 * signed), share, largest, **keywords)
         else:
             step = to_device(np.full_like(dark, 0.3))
             update.update(volume, to_device(signed), step, length=length, **keywords)
         np.testing.assert_allclose(to_host(stepped), expected, rtol=10 * TOLERANCE_F32)
-        if leap is not None:
+        if extrapolation is not None:
             ratio = np.divide(expected, last, out=np.ones_like(expected), where=last > 0)
             ahead = expected * np.clip(ratio, 1 / update.LARGEST_LEAP, update.LARGEST_LEAP) ** beta
-            np.testing.assert_allclose(to_host(leap.ahead), np.where(last > 0, ahead, 0), rtol=20 * TOLERANCE_F32)
+            np.testing.assert_allclose(
+                to_host(extrapolation.ahead), np.where(last > 0, ahead, 0), rtol=20 * TOLERANCE_F32
+            )
 
 
 FLOAT32 = np.finfo(np.float32)
@@ -153,8 +157,8 @@ def test_light_times_exponentials_of_all_sizes(momentum):
     limit = 2 * update.LARGEST_EXPONENT
     expected = light * np.exp(np.clip(exponent.astype(float), -limit, limit))
     stepped, volume = empty(light.size), to_device(light)
-    leap = update.Leap(volume, 0.0, empty(light.size)) if momentum else None
-    update.update(volume, to_device(exponent), voxels.ones(light.size), leap=leap, stepped=stepped)
+    extrapolation = update.Extrapolation(volume, 0.0, empty(light.size)) if momentum else None
+    update.update(volume, to_device(exponent), voxels.ones(light.size), extrapolation=extrapolation, stepped=stepped)
     least = FLOAT32.tiny if momentum else 0
     assert_light(stepped, np.where(light > 0, np.maximum(expected, least), 0))
     assert (to_host(stepped)[light > 0] >= least).all() and not to_host(stepped)[light == 0].any()
@@ -195,13 +199,13 @@ def test_momentum_of_all_ratios(exponent):
         repeated = np.fmin(np.fmax(repeated, 1 / update.LARGEST_LEAP), update.LARGEST_LEAP)
         power = repeated ** np.clip(exponent, -update.LARGEST_MOMENTUM, update.LARGEST_MOMENTUM)
         expected = np.where(last > 0, np.maximum(lifted * power, FLOAT32.tiny), last)
-    volume, leap = to_device(light.copy()), update.Leap(to_device(last), exponent, empty(last.size))
+    volume, extrapolation = to_device(light.copy()), update.Extrapolation(to_device(last), exponent, empty(last.size))
     nothing = zeros(last.size)
-    update.update(volume, nothing, nothing, leap=leap, stepped=volume)
+    update.update(volume, nothing, nothing, extrapolation=extrapolation, stepped=volume)
     np.testing.assert_array_equal(to_host(volume), lifted)
-    assert_light(leap.ahead, expected, TOLERANCE_POWER * max(1, min(abs(exponent), update.LARGEST_MOMENTUM)))
-    np.testing.assert_array_equal(to_host(leap.ahead)[last <= 0], last[last <= 0])
-    assert (to_host(leap.ahead)[last > 0] >= FLOAT32.tiny).all()
+    assert_light(extrapolation.ahead, expected, TOLERANCE_POWER * max(1, min(abs(exponent), update.LARGEST_MOMENTUM)))
+    np.testing.assert_array_equal(to_host(extrapolation.ahead)[last <= 0], last[last <= 0])
+    assert (to_host(extrapolation.ahead)[last > 0] >= FLOAT32.tiny).all()
 
 
 def test_subnormal_light_is_lifted_or_taken_for_zero():
@@ -210,10 +214,10 @@ def test_subnormal_light_is_lifted_or_taken_for_zero():
     light = np.concatenate([light, light, np.float32(np.linspace(0, 1e-30, 100))])
     for beta in (0.0, 0.5, 0.94):
         volume, memory = to_device(light.copy()), to_device(light[::-1].copy())
-        stepped, leap = empty(light.size), update.Leap(memory, beta, empty(light.size))
+        stepped, extrapolation = empty(light.size), update.Extrapolation(memory, beta, empty(light.size))
         signed = to_device(np.float32(np.linspace(-3, 3, light.size)))
-        update.sharpen(volume, signed, zeros(light.size), 0.5, 3.0, leap=leap, stepped=stepped)
-        for found in (to_host(stepped), to_host(leap.ahead)):
+        update.sharpen(volume, signed, zeros(light.size), 0.5, 3.0, extrapolation=extrapolation, stepped=stepped)
+        for found in (to_host(stepped), to_host(extrapolation.ahead)):
             assert ((found >= 0) & (found < 1e-27)).all()
 
 

@@ -136,7 +136,7 @@ def test_epochs_equal_their_dense_twin(weights, subsets):
         floor=floor,
         shortening=ordered_subsets.SHORTENING,
         momentum=ordered_subsets.SUBSET_MOMENTUM,
-        leap=kernels.LARGEST_LEAP,
+        extrapolation=kernels.LARGEST_LEAP,
     )
     even_gain = {name: np.ones(camera.gain.size, np.float32) for name, camera in weights.cameras.items()}
     equations = ImageEquations(

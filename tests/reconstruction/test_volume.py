@@ -188,10 +188,10 @@ def test_momentum_that_only_harms_leaves_plain_smart(monkeypatch):
     weights = random_system(6)
     images, _ = noisy_images(weights, 6)
 
-    def spoil(*arguments, leap, stepped, **keywords):
-        kernels.update(*arguments, leap=leap, stepped=stepped, **keywords)
-        if leap is not None and leap.exponent > 0:
-            voxels.multiply(stepped, voxels.ones(stepped.size), leap.ahead, factor=1e3)
+    def spoil(*arguments, extrapolation, stepped, **keywords):
+        kernels.update(*arguments, extrapolation=extrapolation, stepped=stepped, **keywords)
+        if extrapolation is not None and extrapolation.exponent > 0:
+            voxels.multiply(stepped, voxels.ones(stepped.size), extrapolation.ahead, factor=1e3)
 
     plain = plain_steps.reconstruct(weights, images, iterations=12, accelerate=False)
     monkeypatch.setattr(steps, "update", spoil)
