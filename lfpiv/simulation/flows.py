@@ -225,7 +225,7 @@ class Tracers(Table):
 
     @model_validator(mode="after")
     def _two_instants_or_series(self) -> Tracers:
-        if self.series is not None:
+        if self.is_series:
             unused = sorted({"first", "second", "peak_mm"} & self.model_fields_set)
             if unused:
                 raise ValueError(f"no {unused[0]} with series, whose displacements follow from the positions")
@@ -234,8 +234,13 @@ class Tracers(Table):
     @model_serializer(mode="wrap")
     def _keys_of_its_kind(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
         table: dict[str, Any] = serialise(self)
-        unused = ("series",) if self.series is None else ("first", "second", "peak_mm")
+        unused = ("first", "second", "peak_mm") if self.is_series else ("series",)
         return {key: value for key, value in table.items() if key not in unused}
+
+    @property
+    def is_series(self) -> bool:
+        """Whether there are positions at the instants of a time series, not at two."""
+        return self.series is not None
 
     def tracers(self) -> tuple[np.ndarray, np.ndarray]:
         """Return tracer positions midway in time and displacements, each of shape (n, 3) [mm].
@@ -273,12 +278,17 @@ class Tracers(Table):
         return self._loaded().interpolate(checked_points(points_mm))
 
     def _loaded(self) -> TracerSet:
-        if self.series is not None:
+        if self.is_series:
             raise ValueError("tracers: expected two instants, got a series. Call between(start, end).")
         return load_tracers(self.file, self.first, self.second, self._scaling())
 
     def _scaling(self) -> TracerScaling:
         return TracerScaling(size_mm=self.size_mm, centre_mm=self.centre_mm, box=self.box, peak_mm=self.peak_mm)
+
+
+def tracer_series(flow: Flow) -> Tracers | None:
+    """Return a flow that is given by tracers at the instants of a time series; None for any other flow."""
+    return flow if isinstance(flow, Tracers) and flow.is_series else None
 
 
 Flow = Uniform | Shear | Ring | Swirl | SwirlingJet | Tracers

@@ -30,7 +30,7 @@ from lfpiv.settings.rig import NominalBoard
 from lfpiv.settings.table import Table
 from lfpiv.settings.volume import Volume
 from lfpiv.simulation.board_errors import BoardErrors
-from lfpiv.simulation.flows import Flow, Tracers
+from lfpiv.simulation.flows import Flow, Tracers, tracer_series
 from lfpiv.simulation.image_files import check_pattern
 from lfpiv.simulation.lens import Lens
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
@@ -256,7 +256,7 @@ class Scene(Table):
     @model_validator(mode="after")
     def _series_of_one_kind(self) -> Scene:
         particles, flow = self.particles, self.flow
-        of_series = isinstance(flow, Tracers) and flow.series is not None
+        of_series = tracer_series(flow) is not None
         if particles.instants is None:
             if of_series:
                 raise ValueError("particles.instants with flow.series, tracers at several instants")
@@ -285,9 +285,9 @@ class Scene(Table):
         """
         flow, series = self.flow, self.particles.instants is not None
         mean: Callable[[np.ndarray], np.ndarray] = flow
-        if isinstance(flow, Tracers) and flow.series is not None:
+        if (tracers := tracer_series(flow)) is not None:
             instant = pair - self.particles.first
-            mean = flow.between(instant, instant + self.particles.step)
+            mean = tracers.between(instant, instant + self.particles.step)
         if self.turbulence is None:
             return mean
         return TurbulentFlow(mean, self.turbulence.realisation(seed=(self.seed, 7, 0 if series else pair)))
@@ -315,10 +315,10 @@ def open_scene(path: str | Path) -> Scene:
     if isinstance(scene.flow, Tracers):
         flow = scene.flow.model_copy(update={"file": str((path.parent / scene.flow.file).absolute())})
         # refuse a missing or unsuitable file before any work
-        if flow.series is None:
-            flow.tracers()
-        else:
+        if flow.is_series:
             flow.positions()
+        else:
+            flow.tracers()
         scene = scene.model_copy(update={"flow": flow})
     if any(camera.lens is not None and camera.lens.file is not None for camera in scene.camera):
         scene = scene.model_copy(update={"camera": tuple(_with_lens(path, camera) for camera in scene.camera)})

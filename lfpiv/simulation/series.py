@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.simulation.flows import Tracers
+from lfpiv.simulation.flows import Tracers, tracer_series
 from lfpiv.simulation.light import Brightness, pulse_light
 from lfpiv.simulation.particles import LEAST_INTENSITY, log, seeded_count, seeded_size_mm
 from lfpiv.simulation.scene import Scene
@@ -87,9 +87,10 @@ def place_series(scene: Scene) -> list[SeriesInstant]:
         raise ValueError("scene: expected a scene with particles.instants, got pairs. Call place_particles.")
     flow = scene.flow
     as_given = isinstance(flow, Tracers) and flow.as_given
-    if isinstance(flow, Tracers) and flow.series is not None and len(flow.positions()) < scene.particles.instants:
+    tracers = tracer_series(flow)
+    if tracers is not None and len(tracers.positions()) < scene.particles.instants:
         raise InputError(
-            f"particles.instants: expected at most the {len(flow.positions())} instants of {flow.file}, found "
+            f"particles.instants: expected at most the {len(tracers.positions())} instants of {tracers.file}, found "
             f"{scene.particles.instants}. Lower it."
         )
     states, traits = _given(scene) if as_given else _carried(scene)
@@ -190,15 +191,15 @@ def _motion(scene: Scene) -> Callable[[np.ndarray, int, int], np.ndarray]:
 
     With the sense 1 positions are those at the instant and the result those at the next; with -1 it is the reverse.
     """
-    step, flow = scene.particles.step, scene.flow
-    if not (isinstance(flow, Tracers) and flow.series is not None):
+    step, tracers = scene.particles.step, tracer_series(scene.flow)
+    if tracers is None:
         steady = scene.flow_of(scene.particles.first)
         substeps = -(-SUBSTEPS // step)
         return lambda position, _, sense: runge_kutta(steady, position, sense / step, substeps)
     turbulence = None if scene.turbulence is None else scene.flow_of(scene.particles.first)
 
     def unsteady(position: np.ndarray, instant: int, sense: int) -> np.ndarray:
-        between, middle = flow.between(instant, instant + 1), position
+        between, middle = tracers.between(instant, instant + 1), position
         for _ in range(MIDPOINTS):
             moved = between(middle)
             if isinstance(turbulence, TurbulentFlow):
