@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from lfpiv.joint.spline_field import SplineField
-from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import TRUNCATE, coefficients
 from lfpiv.weights.operator import Weights
@@ -46,11 +46,11 @@ class JointModel:
     ----------
     weights : Weights
         The operator.
-    frames : sequence of two PreparedInstant
+    frames : sequence of two PreparedFrame
         Prepared images of both frames.
     """
 
-    def __init__(self, weights: Weights, frames: Sequence[PreparedInstant]):
+    def __init__(self, weights: Weights, frames: Sequence[PreparedFrame]):
         self.weights, self.frames = weights, tuple(frames)
         self.field = SplineField(weights.grid)
         self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel

@@ -22,7 +22,7 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.joint.fit import JointFit, fit_pair
 from lfpiv.joint.model import JointModel
-from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.motion_field import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings
@@ -148,14 +148,14 @@ class PairSolver:
             if progress is not None:
                 progress(start + fraction * (end - start))
 
-        prepared, found = list[PreparedInstant](), list[Reconstruction]()
+        prepared, found = list[PreparedFrame](), list[Reconstruction]()
         for number, (own, floor, mask) in enumerate(zip(images, floors, masks, strict=True)):
             try:
-                instant = self.smart.prepare(own, floor=floor, mask=mask)
-                one = instant.solve(progress=partial(step, number / 2 * alone, (number + 1) / 2 * alone))
+                frame = self.smart.prepare(own, floor=floor, mask=mask)
+                one = frame.solve(progress=partial(step, number / 2 * alone, (number + 1) / 2 * alone))
             except ValueError as error:
                 raise ValueError(f"frame {number + 1} of the pair: {error}") from error
-            prepared.append(instant)
+            prepared.append(frame)
             found.append(one)
         both = (found[0], found[1])
         result = PairResult(frames=both, unshared=both, estimate=Estimate.ALONE)
@@ -165,7 +165,7 @@ class PairSolver:
         return result
 
     def _joint(
-        self, prepared: Sequence[PreparedInstant], alone: PairResult, progress: Callable[[float], None]
+        self, prepared: Sequence[PreparedFrame], alone: PairResult, progress: Callable[[float], None]
     ) -> PairResult:
         """Return the joint fit that starts from the frames by themselves, or these if they show too few vectors."""
         weights = self.smart.weights

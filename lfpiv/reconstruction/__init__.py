@@ -1,1 +1,1 @@
-"""Volumes from images by SMART (Eq. 5), for one instant or for both instants of a pair."""
+"""Volumes from images by SMART (Eq. 5), for one frame or for both frames of a pair."""

@@ -4,7 +4,7 @@ Reconstructed intensity outside the volume proves nothing, because ghosts lie th
 by themselves show whether particles are there. From the sub-aperture images of one camera each point of a coarse padded
 grid gets the mean logarithm of the light that its rays meet. Where a particle is, both cameras show it, so their
 fluctuations are correlated. Ghosts are crossings of rays from different particles. They appear in the covariance of
-different instants as well, as do static light and the edges of the lit region, and this is subtracted. What is left,
+different frames as well, as do static light and the edges of the lit region, and this is subtracted. What is left,
 averaged over layers parallel to a face and relative to the volume, is the profile of lit particles beyond the face.
 
 Particles inside the volume blur beyond its faces. So light that was found is compared with a null: images of random
@@ -98,7 +98,7 @@ def light_beyond(
     grid : Grid
         The volume.
     pairs : sequence of sequence of dict
-        Particle images of some instants, in groups of instants that show the same particles, such as the frames of a
+        Particle images of some frames, in groups of frames that show the same particles, such as the frames of a
         pair: camera name -> image (rows, columns), background removed [counts].
 
     Returns
@@ -112,13 +112,13 @@ def light_beyond(
         If no images are given.
     """
     if not pairs or not all(pairs):
-        raise ValueError("pairs: expected the images of at least one instant in each group, got none.")
+        raise ValueError("pairs: expected the images of at least one frame in each group, got none.")
     if len(calibration.cameras) < 2:
         return ()
     search = _Search.around(grid, calibration)
-    group = np.repeat(np.arange(len(pairs)), [len(instants) for instants in pairs])
+    group = np.repeat(np.arange(len(pairs)), [len(frames) for frames in pairs])
     views = [_View(camera, search.grid) for camera in calibration.cameras.values()]
-    images = [one for instants in pairs for one in instants]
+    images = [one for frames in pairs for one in frames]
     light = [[view.light(one[name]) for one in images] for name, view in zip(calibration.cameras, views, strict=True)]
     profiles = _profiles(views, light, search, group)
     if not _lit_faces(profiles, search, [np.zeros((1, n)) for n in search.grid.shape]):
@@ -300,18 +300,18 @@ class _Profile:
     """Covariance of two cameras in the layers across one axis."""
 
     same: np.ndarray
-    """Of equal instants less what chance gives, shape (layer,)."""
+    """Of frames with themselves, less what chance gives, shape (layer,)."""
     chance: np.ndarray
     """Deviations of products that only chance correlates from their mean, shape (layer, sample)."""
-    instants: int
+    frames: int
     groups: int
-    """Groups of instants, each of which shows particles of its own."""
+    """Groups of frames, each of which shows particles of its own."""
     seen: np.ndarray
     """Whether two cameras see most of the layer, shape (layer,), bool."""
 
     def deviation(self, layers: np.ndarray) -> float:
         """Return the standard deviation of the sum of `same` over layers if they hold no particles."""
-        return float(self.chance[layers].sum(0).std() / np.sqrt(self.instants))
+        return float(self.chance[layers].sum(0).std() / np.sqrt(self.frames))
 
     def is_clear(self, inner: slice) -> bool:
         """Return whether the layers inside the volume show particles beyond chance."""
@@ -325,7 +325,7 @@ def _profile(
     window = tuple(slice(None) if other == axis else search.inner(other) for other in range(3))
 
     def layered(values: np.ndarray) -> np.ndarray:
-        """Return the part in the window, shape (layer, instant, cell)."""
+        """Return the part in the window, shape (layer, frame, cell)."""
         moved = np.moveaxis(values[(slice(None), *window)], axis + 1, 0)
         return moved.reshape(*moved.shape[:2], -1)
 
@@ -338,7 +338,7 @@ def _profile(
         first, second = layered(fluctuations[one]) * both, layered(fluctuations[two])
         products_ = first @ np.swapaxes(second, 1, 2)
         moved = [(first * layered(np.roll(fluctuations[two], shift, along))).sum(2) for shift in shifts]
-        shifted = np.stack(moved, axis=2)  # layer, instant, shift
+        shifted = np.stack(moved, axis=2)  # layer, frame, shift
         others = products_[:, different] if different.any() else shifted.reshape(len(both), -1)
         same = np.einsum("lii->l", products_) / len(group) - others.mean(1)
         mean, free = shifted.mean(1 if len(group) > 1 else (1, 2), keepdims=True), max(len(group) - 1, 1)
@@ -350,7 +350,7 @@ def _profile(
     return _Profile(
         same=same / counts,
         chance=chance / counts[:, None],
-        instants=len(group),
+        frames=len(group),
         groups=len(np.unique(group)),
         seen=covered,
     )

@@ -60,7 +60,7 @@ def measure_damping(
         Vectors of recorded pairs of one flow, from `measure` or a run; the more, the better is the flow told from
         errors. The flows of as many as are simulated are imitated, evenly spread.
     images : sequence of mappings of str to ndarray
-        Images of some recorded instants, background subtracted: their particles are imitated.
+        Images of some recorded frames, background subtracted: their particles are imitated.
     measure : callable
         ``measure(frames, noise)`` returns the vectors of the images of both frames, measured with the same settings as
         `vectors`. `noise` has the noise of each frame's background for `reconstruct_pair`'s `floor`.
@@ -69,7 +69,7 @@ def measure_damping(
     noise : mapping of str to float, optional
         Noise of each camera's background [counts]; default: that of the dark pixels.
     volume : ndarray, shape (z, y, x), optional
-        Volume of a recorded instant on the grid of the weights, whose smoothed intensity is the light of the particles;
+        Volume of a recorded frame on the grid of the weights, whose smoothed intensity is the light of the particles;
         default: particles are equally bright in the whole grid.
     progress : callable, optional
         Called with the finished fraction.

@@ -24,7 +24,7 @@ def without_dark(guess: np.ndarray, share: float = DARK) -> np.ndarray:
     """Return a first guess whose faintest voxels, with a share of its light, are 0.
 
     SMART leaves zeros as they are and does not visit their weights. So this is for a guess that shows where particles
-    are, such as one from other instants.
+    are, such as one from other frames.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
 """Correct the volumes of a time series by those before and after each: a smoother of fixed lag.
 
-`lfpiv.reconstruction.sequence` follows particles forward in time, so that a volume holds what the instants before it
-show. The instants after it show as much again. Here the volumes of a few instants on each side are moved along the
+`lfpiv.reconstruction.sequence` follows particles forward in time, so that a volume holds what the frames before it
+show. The frames after it show as much again. Here the volumes of a few frames on each side are moved along the
 flow to the present one, as in simultaneous motion tracking enhancement [1]_. Particles are in all of them. A ghost
 moves with the mean of the particles whose lines of sight cross in it, so it is elsewhere in most of them.
 
-The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n those of all instants moved to
+The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n those of all frames moved to
 it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
 places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
 which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark ones stay
@@ -38,20 +38,20 @@ sum E^2 / sum E."""
 ROUGHEST = 0.18
 """Largest roughness of a displacement by which particles are moved [voxel]."""
 FAINT = 0.01
-"""Share of the light in the voxels that are left out of the guess before instants are compared, without a sieve."""
+"""Share of the light in the voxels that are left out of the guess before frames are compared, without a sieve."""
 
 
 def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow: xr.Dataset) -> np.ndarray:
-    """Return the guess of an instant from its volume and those of the instants beside it.
+    """Return the guess of a frame from its volume and those of the frames beside it.
 
     Parameters
     ----------
     own : Reconstruction
-        The instant from its images and the instants before it.
+        The frame from its images and the frames before it.
     others : mapping of int to Reconstruction
-        Number of instants from each to the present instant, negative for later ones -> the instant.
+        Number of frames from each to the present frame, negative for later ones -> the frame.
     flow : Dataset
-        From `mean_flow`: displacement from one instant to the next [voxel of the vectors' volumes].
+        From `mean_flow`: displacement from one frame to the next [voxel of the vectors' volumes].
 
     Returns
     -------
@@ -92,7 +92,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
 
 
 def mean_flow(flows: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return the mean of displacements from one instant to the next, over those that are valid.
+    """Return the mean of displacements from one frame to the next, over those that are valid.
 
     A vector of the mean is valid if one of them is. Where none is, it is the mean of the replaced ones.
     """

@@ -1,6 +1,6 @@
 """Flow of a time series: the displacement between two successive volumes, by which the next one is predicted.
 
-A flow that is not known is measured by all passes of `lfpiv.correlate`. Later the flow known from the instants before
+A flow that is not known is measured by all passes of `lfpiv.correlate`. Later the flow known from the frames before
 deforms the volumes, and one pass in the last window is left. Where the flow has changed so much that this pass fails,
 all passes are done again. The uncertainty is left out: nobody reads it.
 """
@@ -22,7 +22,7 @@ from lfpiv.velocity.settings import DEFAULTS, CorrelationSettings, cut_windows, 
 
 WINDOWS = (*DEFAULT_WINDOWS[:-1], 8, 8)
 """Windows in which the flow is measured where none are stated [voxel], cut to the volume. They are smaller than those
-of vectors: the motion within them is not resolved, and the scatter of few particles is averaged over the instants."""
+of vectors: the motion within them is not resolved, and the scatter of few particles is averaged over the frames."""
 OVERLAP = 0.6
 """Overlap of these windows."""
 
@@ -39,7 +39,7 @@ def measure_flow(
     correlation : mapping
         Settings of `lfpiv.correlate`. Windows that are None are `WINDOWS`, with `OVERLAP`.
     known : Dataset, optional
-        Displacement between two instants before, from this function.
+        Displacement between two frames before, from this function.
 
     Returns
     -------

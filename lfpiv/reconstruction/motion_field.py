@@ -59,7 +59,7 @@ class MotionField:
     def carried(
         self, coefficients: np.ndarray, steps: int, wanted: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Carry a volume, given by its spline coefficients, to the instant of a frame `steps` frames before its own.
+        """Carry a volume, given by its spline coefficients, to the frame `steps` frames before its own.
 
         `steps` is negative for a frame after it. Returns the volume's light at the places of that frame's particles, 0
         outside, and how far inside the volume the place is: 1 inside, 0 a voxel beyond it. With `wanted`, flat indices

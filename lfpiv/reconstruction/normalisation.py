@@ -1,6 +1,6 @@
 """What SMART needs to know of a rig besides the images: sums of the weights, which voxels are seen, and step sizes.
 
-All of it is the same for every instant whose cameras are found equally bright, so it is computed once, and stays on the
+All of it is the same for every frame whose cameras are found equally bright, so it is computed once, and stays on the
 device.
 """
 
@@ -35,7 +35,7 @@ from lfpiv_kernels.transfer import DeviceArray, to_device
 COMPARED = 8
 """By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
 FOLLOWED_STEPS = 8
-"""Number of steps by subsets of all cameras from the volume of the instant before, without a sieve."""
+"""Number of steps by subsets of all cameras from the volume of the frame before, without a sieve."""
 LEAST_PART = 0.02
 """Least share of a voxel's weights in the sum over a part of the rays. A part may not light each voxel."""
 LEAST_COLUMN_SUM = 0.02
@@ -131,7 +131,7 @@ class LensSubsets(Normalisation):
     suffice = False
     """Whether passes that are left when the subsets contradict each other are left out."""
     part: tuple[Subset, DeviceArray] | None = None
-    """Rays by which instants are compared quickly, and the sum of each voxel's weights over them; None for all."""
+    """Rays by which frames are compared quickly, and the sum of each voxel's weights over them; None for all."""
 
     @property
     def sample(self) -> tuple[Subset, ...]:
@@ -149,7 +149,7 @@ class LensSubsets(Normalisation):
 
     @property
     def followed(self) -> tuple[Partition, ...]:
-        """The subsets by which an instant is reconstructed from the volume of the one before; none for whole passes."""
+        """The subsets by which a frame is reconstructed from the volume of the one before; none for whole passes."""
         return self.partitions if self.has_subsets else ()
 
     @property
@@ -159,7 +159,7 @@ class LensSubsets(Normalisation):
 
     @cached_property
     def correcting(self) -> Partition:
-        """The subset by which an instant is corrected after its comparison with those beside it: all rays."""
+        """The subset by which a frame is corrected after its comparison with those beside it: all rays."""
         return Partition((whole_subset(len(self._weights.cameras)),), self.steps[:1])
 
     def passes(self, count: int, whole: int | None) -> tuple[int, int]:
@@ -188,7 +188,7 @@ class LensSubsets(Normalisation):
         return total
 
     def _kept_sums(self, name: str, ray_set: int) -> np.ndarray:
-        """Return the sums of one set of rays, which later instants need, too."""
+        """Return the sums of one set of rays, which later frames need, too."""
         derived, key = self._weights.derived, ("sums of a set", name, ray_set)
         if key not in derived:
             derived[key] = self._weights.sums_of_set(name, ray_set)
@@ -213,7 +213,7 @@ class RowSubsets(Normalisation):
 
     @cached_property
     def followed(self) -> tuple[Partition, ...]:
-        """The subsets by which an instant is reconstructed from the volume of the one before.
+        """The subsets by which a frame is reconstructed from the volume of the one before.
 
         Without a sieve `FOLLOWED_STEPS` of them.
         """
@@ -223,7 +223,7 @@ class RowSubsets(Normalisation):
 
     @cached_property
     def correcting(self) -> Partition:
-        """The subset by which an instant is corrected after its comparison with those beside it.
+        """The subset by which a frame is corrected after its comparison with those beside it.
 
         It has some ray rows of all cameras, see `correcting_subset`.
         """

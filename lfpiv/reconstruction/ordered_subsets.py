@@ -63,7 +63,7 @@ WHOLE_PASSES = 2
 POINT_PASSES = 5
 """The same after subsets of all cameras without a sieve, which are left early."""
 FOLLOWING_TIME = 8.0
-"""Nesterov's time at which the momentum begins in an instant that starts from the one before. Its few steps are longer
+"""Nesterov's time at which the momentum begins in a frame that starts from the one before. Its few steps are longer
 than plain ones. The time is 1 where there is no sieve and subsets are of lenses: longer steps by these follow the
 noise."""
 SHORTENING = 0.05
@@ -74,7 +74,7 @@ exponents."""
 JOINT_CONFLICT, POINT_CONFLICT = 0.1, 0.5
 """Agreement of subsets of all cameras below which the passes over all rays follow, with a sieve and without."""
 CORRECTING, FEWEST_ROWS = 4, 3
-"""Number of parts of the ray rows, one of which corrects an instant, and the least number of rows of a part."""
+"""Number of parts of the ray rows, one of which corrects a frame, and the least number of rows of a part."""
 MOST_STEPS = 128
 """Steps by subsets after which no other epoch of subsets of all cameras begins."""
 
@@ -186,7 +186,7 @@ def joint_subsets(cameras: int, sets: int, count: int) -> tuple[Subset, ...]:
 
 
 def correcting_subset(cameras: int, sets: int) -> tuple[tuple[Subset, ...], int]:
-    """Divide the ray rows of all cameras into parts; return them and the number of the one that corrects an instant.
+    """Divide the ray rows of all cameras into parts; return them and the number of the one that corrects a frame.
 
     There are `CORRECTING` parts, or fewer where parts would have less than `FEWEST_ROWS` rows. The chosen one has no
     row by which guesses are compared, unless it has all rows.

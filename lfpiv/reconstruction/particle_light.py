@@ -1,4 +1,4 @@
-"""`LightField`: how bright particles are where, from a volume of some instant."""
+"""`LightField`: how bright particles are where, from a volume of some frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REACH = 1 / 6
 
 
 class LightField:
-    """Relative light of a particle at any place: a smoothed volume of some instant, or the same everywhere.
+    """Relative light of a particle at any place: a smoothed volume of some frame, or the same everywhere.
 
     Particles may end within the grid, whose outer layers pad the volume. So the volume is smoothed only where it is
     lit, and its dark rim stays dark. Along each axis a layer is lit by the share of the median layer that the layers

@@ -41,13 +41,13 @@ def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[
         The volume. The weights of its middle, at most `LARGEST_PART` voxels along each axis, are built, and those of as
         many coarse voxels for the light of the whole.
     images : sequence of dict
-        Some instants: camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
+        Some frames: camera name -> image, shape (rows, columns) [counts], background subtracted, its noise included.
 
     Returns
     -------
     float or None
         Standard deviation of the particles [voxel of the grid], as of `ParticleSizer.size`: root mean square over the
-        instants. None if it can be measured in none of them.
+        frames. None if it can be measured in none of them.
     """
     middle = _central(grid, min(LARGEST_PART * grid.voxel_mm, max(grid.shape) * grid.voxel_mm), grid.voxel_mm)
     weights, even = build_weights(calibration, middle, form="pixels"), None

@@ -29,7 +29,7 @@ class SmartStop(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruction:
-    """Volume of one instant; figures of cameras are by camera name."""
+    """Volume of one frame; figures of cameras are by camera name."""
 
     grid: Grid
     volume: np.ndarray
@@ -57,12 +57,12 @@ class Reconstruction:
 
     @property
     def blurred(self) -> np.ndarray:
-        """The volume smoothed by the size of a particle, in which instants are compared, float32."""
+        """The volume smoothed by the size of a particle, in which frames are compared, float32."""
         return light.smoothed(self.volume, SMOOTHING_VOXEL)
 
     @cached_property
     def spline(self) -> np.ndarray:
-        """Spline coefficients of the smoothed volume, by which it is moved to other instants, float32."""
+        """Spline coefficients of the smoothed volume, by which it is moved to other frames, float32."""
         return deform.spline_coefficients(self.blurred)
 
     @property

@@ -1,13 +1,13 @@
-"""`SequenceSolver`: SMART along a time series, where each instant learns from those before and after it.
+"""`SequenceSolver`: SMART along a time series, where each frame learns from those before and after it.
 
 Images of two cameras hardly distinguish particles from ghosts: SMART keeps what its first guess holds. Particles move
 with the flow, and a ghost moves with the flow only where all particles on its lines of sight move alike. So the volume
-of the instant before, moved by the flow, is a better first guess than one from the images alone, and needs fewer
+of the frame before, moved by the flow, is a better first guess than one from the images alone, and needs fewer
 iterations. This is the sequential form of motion tracking enhancement [1]_, [2]_.
 
 The guess is the product of powers M^p F^(1 - p) of the moved volume M and the guess F from the images, with the
 exponent p = `PERSISTENCE` where the flow is known, and 0 elsewhere. SMART multiplies its first guess, so what the
-images do not determine is forgotten by the factor p in each instant. Particles that enter through a face come from F.
+images do not determine is forgotten by the factor p in each frame. Particles that enter through a face come from F.
 
 So the volumes go forward in time. Afterwards each is corrected by the volumes on both sides of it
 (`lfpiv.reconstruction.fixed_lag`), which changes no other one.
@@ -33,7 +33,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
 from lfpiv.reconstruction.flow import measure_flow
-from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.motion_field import LEAST_VALID, MotionField
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import coefficients
@@ -45,11 +45,11 @@ from lfpiv_kernels.correlation import deform
 PERSISTENCE = 0.9
 """Exponent of the moved volume in the first guess."""
 FLOW_MEMORY = 0.7
-"""Weight of the flow known before in the flow that moves the next instant."""
+"""Weight of the flow known before in the flow that moves the next frame."""
 FIRST_SHARE = 0.35
-"""Iterations of an instant that starts from its images, as a share of those of an instant by itself."""
+"""Iterations of a frame that starts from its images, as a share of those of a frame by itself."""
 ITERATION_SHARE = 0.2
-"""Iterations of a predicted instant over iterations of an independent instant."""
+"""Iterations of a predicted frame over iterations of an independent frame."""
 SHARE_SUBSETS = 4
 """Number of subsets up to which `ITERATION_SHARE` holds. With more subsets, fewer iterations make as many steps."""
 DIMMEST = 0.05
@@ -60,7 +60,7 @@ FAINTEST = 1e-6
 CORRECTING_TIME = 2.0
 """Nesterov's time at which the momentum begins in a correction: its few steps are longer than plain ones."""
 TRIES = 2
-"""Successive instants whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
+"""Successive frames whose flow is too rough to be followed after which no flow of a segment is looked at any more."""
 LEAST_AGREEMENT = 0.9
 """Largest misfit of a prediction, as a share of the misfit of particles in other places."""
 
@@ -69,7 +69,7 @@ MeasureFlow = Callable[[xr.DataArray, xr.DataArray, Mapping[str, Any], xr.Datase
 
 
 class Start(enum.Enum):
-    """From what an instant started; the text says why."""
+    """From what a frame started; the text says why."""
 
     FIRST = "the flow is not known yet"
     PREDICTED = "started from the instant before, moved by the flow"
@@ -79,44 +79,44 @@ class Start(enum.Enum):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Before:
-    """What is known at an instant, for the next one."""
+    """What is known at a frame, for the next one."""
 
     volume: np.ndarray
     """Volume on the grid of the reconstruction, shape (z, y, x), float32."""
     measured: xr.DataArray
     """Volume on the grid of the experiment, in which the flow is measured."""
     earlier: xr.DataArray | None = None
-    """The same of the instant before; None where the particles cannot be followed from it."""
+    """The same of the frame before; None where the particles cannot be followed from it."""
     flow: xr.Dataset | None = None
-    """Displacement from one instant to the next as known at the instant before; None if it is not known."""
+    """Displacement from one frame to the next as known at the frame before; None if it is not known."""
     unresolved: int = 0
-    """Number of the last instants, one after the other, whose flow was too rough to be followed."""
+    """Number of the last frames, one after the other, whose flow was too rough to be followed."""
 
     @property
     def given_up(self) -> bool:
-        """Whether all following instants are reconstructed by themselves."""
+        """Whether all following frames are reconstructed by themselves."""
         return self.unresolved >= TRIES
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solved:
-    """One instant of a sequence, from its images and the instants before it."""
+    """One frame of a sequence, from its images and the frames before it."""
 
-    prepared: PreparedInstant | None
+    prepared: PreparedFrame | None
     """The images; None once they are not needed any more."""
     found: Reconstruction
     start: Start
     flow: xr.Dataset | None = None
-    """Displacement from one instant to the next, as it was known before this instant."""
+    """Displacement from one frame to the next, as it was known before this frame."""
     vectors: xr.Dataset | None = None
-    """Displacement between the two instants before this one; None if it was not measured."""
+    """Displacement between the two frames before this one; None if it was not measured."""
     misfit_ratio: float = math.nan
     """Misfit of a prediction that missed over that of particles in other places; NaN for other starts."""
 
     def before(self, measured: xr.DataArray, last: Before | None) -> Before:
-        """Return what the next instant starts from. `measured` is this volume on the grid of the experiment.
+        """Return what the next frame starts from. `measured` is this volume on the grid of the experiment.
 
-        Particles are not followed from the instant before if the prediction missed. The flow stays known: one dark
+        Particles are not followed from the frame before if the prediction missed. The flow stays known: one dark
         image does not change it.
         """
         earlier = None if last is None or self.start is Start.MISSED else last.measured
@@ -132,7 +132,7 @@ class SequenceSolver:
     Parameters
     ----------
     smart : SmartSolver
-        Solver of each instant. One that starts from the instant before has `ITERATION_SHARE` of its iterations.
+        Solver of each frame. One that starts from the frame before has `ITERATION_SHARE` of its iterations.
     correlation : mapping, optional
         Settings of `correlate`, which measures the flow; default: those of an experiment without such a table. Windows
         that are None are those of `lfpiv.reconstruction.flow`.
@@ -159,9 +159,9 @@ class SequenceSolver:
         mask: np.ndarray | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Solved:
-        """Reconstruct an instant from its images and the one before; arguments as of `SmartSolver.solve`.
+        """Reconstruct a frame from its images and the one before; arguments as of `SmartSolver.solve`.
 
-        `before` is what is known at the instant before; None reconstructs the instant from its images alone.
+        `before` is what is known at the frame before; None reconstructs the frame from its images alone.
 
         Raises
         ------
@@ -204,21 +204,21 @@ class SequenceSolver:
     def correct(
         self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None
     ) -> Reconstruction:
-        """Reconstruct one instant again from those before and after it.
+        """Reconstruct one frame again from those before and after it.
 
         Parameters
         ----------
         trail : sequence of Solved
-            Successive instants that show the same particles, at most `lfpiv.experiment.segments.REACH` on each side.
+            Successive frames that show the same particles, at most `lfpiv.experiment.segments.REACH` on each side.
         at : int
-            Index of the instant in `trail`.
+            Index of the frame in `trail`.
         progress : callable, optional
             Called with the finished fraction.
 
         Returns
         -------
         Reconstruction
-            If the flow between the instants is not known well enough, the one by `SmartSolver.solve`, from its images.
+            If the flow between the frames is not known well enough, the one by `SmartSolver.solve`, from its images.
         """
         own = trail[at]
         assert own.prepared is not None
@@ -236,9 +236,9 @@ class SequenceSolver:
         return own.found.continued_by(after)
 
     def _continued(
-        self, prepared: PreparedInstant, guess: np.ndarray, count: int, progress: Callable[[float], None] | None
+        self, prepared: PreparedFrame, guess: np.ndarray, count: int, progress: Callable[[float], None] | None
     ) -> Reconstruction:
-        """Reconstruct an instant from a guess by the one before, in `count` iterations or by as many steps of subsets.
+        """Reconstruct a frame from a guess by the one before, in `count` iterations or by as many steps of subsets.
 
         Its last misfit is NaN.
         """
@@ -249,7 +249,7 @@ class SequenceSolver:
         return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
 
     def _flow(self, before: Before | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
-        """Return the displacement by which the next instant is predicted, and the last one measured, if known."""
+        """Return the displacement by which the next frame is predicted, and the last one measured, if known."""
         if before is None:
             return None, None
         if before.earlier is None:
@@ -267,16 +267,16 @@ class SequenceSolver:
 
 
 def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset) -> np.ndarray:
-    """Return the first guess of an instant from the volume of the instant before.
+    """Return the first guess of a frame from the volume of the frame before.
 
     Parameters
     ----------
     volume : ndarray, shape (z, y, x), float32
-        Volume of the instant before.
+        Volume of the frame before.
     plain : Reconstruction
-        First guess of the instant from its images alone.
+        First guess of the frame from its images alone.
     flow : Dataset
-        From `correlate`: displacement from one instant to the next [voxel of the vectors' volumes].
+        From `correlate`: displacement from one frame to the next [voxel of the vectors' volumes].
 
     Returns
     -------
@@ -304,7 +304,7 @@ def _concentrated(guess: np.ndarray, like: Reconstruction) -> np.ndarray:
 
 
 def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, Reconstruction]:
-    """Return other instants from which particles are moved to one, by the number of steps to it."""
+    """Return other frames from which particles are moved to one, by the number of steps to it."""
     steps = {number: at - number for number in range(len(trail)) if number != at}
     return {step: trail[number].found for number, step in steps.items() if abs(step) * rough <= ROUGHEST}
 

@@ -1,4 +1,4 @@
-"""`SmartSolver`: SMART for one rig. Made once, it reconstructs the volume of every instant from its images."""
+"""`SmartSolver`: SMART for one rig. Made once, it reconstructs the volume of every frame from its images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 
 from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.depth_spread import rows_resolve_depth
-from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
 from lfpiv.reconstruction.ordered_subsets import Subset, joint_subsets, subsets_of, whole_subset
@@ -57,7 +57,7 @@ class SmartSolver:
         first: np.ndarray | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Reconstruction:
-        """Reconstruct one instant; arguments and exceptions as of `lfpiv.reconstruct`.
+        """Reconstruct one frame; arguments and exceptions as of `lfpiv.reconstruct`.
 
         `iterations` replaces that of the settings.
         """
@@ -70,8 +70,8 @@ class SmartSolver:
         *,
         floor: float | Mapping[str, float] | None = None,
         mask: Volume | None = None,
-    ) -> PreparedInstant:
-        """Measure what SMART needs to know of the images of one instant; arguments and exceptions as of `solve`."""
+    ) -> PreparedFrame:
+        """Measure what SMART needs to know of the images of one frame; arguments and exceptions as of `solve`."""
         images = checked_images(self.weights, images)
         solid = None if mask is None else checked_mask(mask, self.weights.grid.axes_mm)
         sieve, cap = self._sieve_and_cap(images)
@@ -89,7 +89,7 @@ class SmartSolver:
                 for name, one in recordings.items()
             ]
         )
-        return PreparedInstant(
+        return PreparedFrame(
             stored=self.weights.stored,
             settings=self.settings,
             recordings=recordings,
@@ -103,7 +103,7 @@ class SmartSolver:
     def _normalisation(
         self, camera_gains: dict[str, float], sieve: Sieve, solid: np.ndarray | None
     ) -> LensSubsets | RowSubsets:
-        """Return what all instants with these brightnesses, sieve and mask share; the last is kept."""
+        """Return what all frames with these brightnesses, sieve and mask share; the last is kept."""
         key = (*camera_gains.values(), sieve)
         if self._last is None or self._last[0] != key or not _same(self._last[1], solid):
             kind = RowSubsets if self.weights.rows > 1 and len(self.subsets) > 1 else LensSubsets

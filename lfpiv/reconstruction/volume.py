@@ -35,7 +35,7 @@ def reconstruct(
     same misfit in at most half the iterations; the misfit still falls in every one, and the limit is the same. The
     first guess is ``exp(sum_i w log(I + b) / sum_i w)``, less the floor's own share, scaled to the images' light.
 
-    For many instants make one `lfpiv.reconstruction.solver.SmartSolver`. `lfpiv.measure_pair` adds what a run does
+    For many frames make one `lfpiv.reconstruction.solver.SmartSolver`. `lfpiv.measure_pair` adds what a run does
     besides: guard layers, finer voxels, light that stands still.
 
     Parameters

@@ -26,7 +26,7 @@ import xarray as xr
 from lfpiv import metrics
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.reconstruction import instant, sequence
-from lfpiv.reconstruction.instant import PreparedInstant
+from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.sequence import SequenceSolver
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.runs import rig
@@ -74,11 +74,11 @@ PARTS = {
     "images": (SmartSolver, "prepare"),
     "flow": (SequenceSolver, "_flow"),
     "guess": (sequence, "predicted_guess"),
-    "check": (PreparedInstant, "sampled_misfit"),
+    "check": (PreparedFrame, "sampled_misfit"),
     "guess of the correction": (sequence, "agreed_guess"),
     "first guess": (instant, "multiplicative_guess"),
     "subsets": (instant, "_run_epochs"),
-    "whole passes": (PreparedInstant, "_solve_whole"),
+    "whole passes": (PreparedFrame, "_solve_whole"),
     "all": (Reconstructor, "instant"),
     "followed": (Reconstructor, "follow"),
     "corrected": (Reconstructor, "correct"),

@@ -65,7 +65,7 @@ def test_few_particles_at_the_faces_of_single_pairs_are_no_light_beyond(calibrat
 def test_one_camera_shows_no_depth(calibration, weights):
     left = {"left": calibration.cameras["left"]}
     assert light_beyond(Calibration(left), VOLUME, images_of(weights, -HALF_MM, 2 * HALF_MM)) == ()
-    with pytest.raises(ValueError, match="at least one instant"):
+    with pytest.raises(ValueError, match="at least one frame"):
         light_beyond(calibration, VOLUME, [])
 
 

@@ -1,4 +1,4 @@
-"""`PreparedInstant.refine`: steps by a part of the rays from a first guess that shows where particles are."""
+"""`PreparedFrame.refine`: steps by a part of the rays from a first guess that shows where particles are."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`PreparedInstant`: the images of one instant and all that SMART needs to reconstruct it, perhaps several times."""
+"""`PreparedFrame`: the images of one frame and all that SMART needs to reconstruct it, perhaps several times."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedInstant:
-    """Images of one instant with all that SMART needs to know of them. Made by `SmartSolver.prepare`."""
+class PreparedFrame:
+    """Images of one frame with all that SMART needs to know of them. Made by `SmartSolver.prepare`."""
 
     stored: StoredGrid
     settings: SmartSettings
@@ -51,7 +51,7 @@ class PreparedInstant:
         brief: bool = False,
         progress: Callable[[float], None] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the instant; arguments and exceptions as of `SmartSolver.solve`.
+        """Reconstruct the frame; arguments and exceptions as of `SmartSolver.solve`.
 
         `whole_passes` is the number of passes over all rays after those over subsets; default: that of the subsets. A
         `brief` reconstruction over subsets leaves out what nobody reads: the projection before the first epoch, whose
@@ -92,7 +92,7 @@ class PreparedInstant:
         brief: bool = False,
         progress: Callable[[float], None] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the instant from a first guess that shows already where particles are, by subsets of the rays.
+        """Reconstruct the frame from a first guess that shows already where particles are, by subsets of the rays.
 
         No pass over all rays follows. Misfits are those of the subsets before each step, scaled to the light of all
         rays. After the last step it is that of `RowSubsets.sample`, scaled likewise. Without a sieve voxels
