@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -26,12 +26,59 @@ from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, Volume
 from lfpiv.runs.frame_light import FrameLight, compare
 
 if TYPE_CHECKING:
-    from lfpiv.runs.pair import PairWork
+    from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.experiment.experiment import Experiment
+    from lfpiv.reconstruction.sequence import Before
+    from lfpiv.runs.pair_volumes import Followed
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+
+
+class FrameWork(Protocol):
+    """The work on one frame, which `lfpiv.runs.pair` does."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment, which numbers the frames."""
+
+    @property
+    def cameras(self) -> Mapping[str, CalibratedCamera]:
+        """Cameras that know what stands still in their images."""
+
+    @property
+    def keep_volumes(self) -> bool:
+        """Whether volumes are written into the output folder."""
+
+    @property
+    def scratch(self) -> Path | None:
+        """Folder in which processes store volumes for each other; None for a process by itself."""
+
+    def require_weights(self, file: VolumeFile) -> None:
+        """Raise InputError if a volume that is not in the folder cannot be reconstructed."""
+
+    def light_again(self, frame: Frame) -> FrameLight:
+        """Read the images of a frame, also if its volume is known."""
+
+    def log_warnings(self, pair: int, warnings: Sequence[Warning]) -> None:
+        """Log the first warning of each code about a pair or its frames."""
+
+    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one frame by itself."""
+
+    def reconstruct_pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
+        """Reconstruct both frames of an image pair together."""
+
+    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
+        """Reconstruct a frame of a series from its predecessor; return it and what its successor needs."""
+
+    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
+        """Reconstruct one of successive frames again from those before and after it."""
+
+    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
+        """Start to write a result of the present pair."""
 
 
 class Failure(Exception):
@@ -64,10 +111,10 @@ class HeldFrame:
 class Frames:
     """The frames of the present pair of a stretch, each reconstructed by itself.
 
-    Volumes are taken from the output folder, from another process (`PairWork.scratch`), or reconstructed.
+    Volumes are taken from the output folder, from another process (`FrameWork.scratch`), or reconstructed.
     """
 
-    work: PairWork
+    work: FrameWork
     stored: Collection[int] = ()
     """Frames whose volumes are stored for other processes."""
     held: dict[Frame, HeldFrame | Failure] = field(default_factory=dict)

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from lfpiv.experiment import segments
 from lfpiv.experiment.recording import Frame
@@ -24,12 +23,9 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.reconstruction.sequence import Before, Start
 from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.runs.frames import Failure, Frames, HeldFrame, attempted
+from lfpiv.runs.frames import Failure, Frames, FrameWork, HeldFrame, attempted
 from lfpiv.runs.pair_volumes import Followed
 from lfpiv.warn import Code, Warning
-
-if TYPE_CHECKING:
-    from lfpiv.runs.pair import PairWork
 
 
 @dataclass(eq=False)
@@ -77,7 +73,7 @@ class FollowedFrames(Frames):
 class Segment:
     """The frames of one segment, as far as they are reconstructed."""
 
-    work: PairWork
+    work: FrameWork
     number: int
     done: int | None = None
     """The last instant that is finished."""
