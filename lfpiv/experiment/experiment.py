@@ -187,7 +187,7 @@ class Experiment(Shown):
 
     def name_of(self, pair: int) -> str:
         """Return "pair" or, in a series, "instant" with the number, for messages."""
-        return f"{self.noun} {pair}"
+        return self.recording.name_of(pair)
 
     @property
     def noun(self) -> str:

@@ -141,6 +141,14 @@ class Recording:
         """Return both frames of a pair."""
         return self.frame_of(pair, 0), self.frame_of(pair, 1)
 
+    def named(self, pair: int, name: str) -> Frame:
+        """Return the frame of a pair by its name."""
+        return self.frame_of(pair, self.names.index(name))
+
+    def name_of(self, pair: int) -> str:
+        """Return "pair" or, in a series, "instant" with the number, for messages."""
+        return f"{self.noun} {pair}"
+
     def new_frames(self, pair: int) -> tuple[Frame, ...]:
         """Return the frames of a pair that no other pair begins with: both, or the first instant of a series."""
         return self.of_pair(pair)[: self.lasers]
@@ -172,3 +180,7 @@ class Recording:
     def by_frame(self, warning: Warning, frame: Frame) -> Warning:
         """Return a warning about a frame with its number, if it has no name within its pair."""
         return replace(warning, instants=(frame.number,)) if frame.name is None else warning
+
+
+PAIRS = Recording()
+"""An image pair, for what has to do with names only."""

@@ -19,7 +19,6 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.report import background, markup, overview, pairs, tracks, volumes
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import vectors as vector_section
-from lfpiv.report.naming import Naming
 from lfpiv.report.summary import Summary
 
 if TYPE_CHECKING:
@@ -69,23 +68,23 @@ def write_report(
         If a figure of the summary is missing or has the wrong type.
     """
     figures = Summary.model_validate(summary)
-    naming = Naming.of(experiment)
-    every = pairs.section(figures.pairs, figures.failed, figures.finished_count, naming) if figures.pairs else ""
+    recording = experiment.recording
+    every = pairs.section(figures.pairs, figures.failed, figures.finished_count, recording) if figures.pairs else ""
     sections = {
-        "vectors": vector_section.section(vectors, naming, figures.damping),
-        "volumes": volumes.section(figures.pairs, vectors, naming) if vectors else "",
+        "vectors": vector_section.section(vectors, recording, figures.damping),
+        "volumes": volumes.section(figures.pairs, vectors, recording) if vectors else "",
         "pairs": every + tracks.section(figures.tracks, path.parent) if figures.pairs else "",
         "run": overview.run_facts(experiment, figures),
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),
-        "time": overview.timings(figures, naming.noun),
+        "time": overview.timings(figures, recording.noun),
         "settings": overview.settings_and_versions(figures),
     }
     body = [
         overview.head(experiment),
-        overview.warnings(figures, naming.noun),
+        overview.warnings(figures, recording.noun),
         overview.verdict(experiment, figures),
-        overview.contents(sections, naming.noun),
+        overview.contents(sections, recording.noun),
         *sections.values(),
     ]
     scripts = "\n".join(_asset(name) for name in _SCRIPTS)

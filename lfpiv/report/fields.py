@@ -23,9 +23,9 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import hdf5
+from lfpiv.experiment.recording import PAIRS, Recording
 from lfpiv.geometry.grid import AXES
 from lfpiv.report import flow
-from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.results import netcdf
 
 log = logging.getLogger(__name__)
@@ -62,15 +62,15 @@ class Survey:
     """Number of pairs in mean and fluctuation."""
 
 
-def survey(vectors: Mapping[int, Path], naming: Naming = PAIRS) -> Survey:
+def survey(vectors: Mapping[int, Path], recording: Recording = PAIRS) -> Survey:
     """Read an evenly spaced sample of the pairs; average one file after the other.
 
     Parameters
     ----------
     vectors : dict
         Pair -> file of its vectors; at least one.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def survey(vectors: Mapping[int, Path], naming: Naming = PAIRS) -> Survey:
     for pair in chosen:
         velocity, valid, axes = _read_velocity(vectors[pair])
         if any(not np.array_equal(axis, first[name]) for name, axis in axes.items()):
-            names = naming.result(pair), naming.result(chosen[0])
+            names = recording.name_of(pair), recording.name_of(chosen[0])
             log.warning("%s: its vectors lie elsewhere than those of %s; it is not in the mean", *names)
             continue
         good = valid & np.isfinite(velocity).all(0)
@@ -124,7 +124,7 @@ def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Data
     return xr.Dataset({**variables, "valid": (AXES, valid), **masked}, coordinates)
 
 
-def embed(found: Survey, view: flow.View, naming: Naming = PAIRS) -> tuple[str, int]:
+def embed(found: Survey, view: flow.View, recording: Recording = PAIRS) -> tuple[str, int]:
     """Encode the fields of a survey for the scripts.
 
     All fields share one block of little-endian 16-bit integers, which is gzipped and written in base64. A JSON text
@@ -136,8 +136,8 @@ def embed(found: Survey, view: flow.View, naming: Naming = PAIRS) -> tuple[str, 
         From `survey`.
     view : flow.View
         What the first field is shown by at the start.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
 
     Returns
     -------
@@ -146,11 +146,11 @@ def embed(found: Survey, view: flow.View, naming: Naming = PAIRS) -> tuple[str, 
     thinning : int
         Largest step along x and y at which vectors are in the page.
     """
-    fields = [(naming.result(pair), vectors, "velocity") for pair, vectors in found.shown.items()]
+    fields = [(recording.name_of(pair), vectors, "velocity") for pair, vectors in found.shown.items()]
     first = fields[0][1]
     kinds = flow.describe(first)
     if found.mean is not None and found.fluctuation is not None:
-        count = f"{found.read:,} {naming.noun}s"
+        count = f"{found.read:,} {recording.noun}s"
         fields += [(f"mean of {count}", found.mean, "velocity")]
         fields += [(f"fluctuation (standard deviation), {count}", found.fluctuation, "fluctuation")]
     block, described, thinning = bytearray(), [], 1

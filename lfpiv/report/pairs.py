@@ -9,11 +9,11 @@ from typing import SupportsFloat
 
 import numpy as np
 
+from lfpiv.experiment.recording import PAIRS, Recording
 from lfpiv.quantities import Scale, scale_of, significant
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
 from lfpiv.report.markup import number, percent
-from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.summary import Failure, PairFigures
 from lfpiv.report.svg import SERIES, new_panel, spread_ticks, style, to_svg
 
@@ -80,7 +80,7 @@ def section(
     pairs: Sequence[PairFigures],
     failures: Sequence[Failure],
     finished: int | None = None,
-    naming: Naming = PAIRS,
+    recording: Recording = PAIRS,
 ) -> str:
     """Return the section on all pairs, as HTML.
 
@@ -92,13 +92,13 @@ def section(
         Pairs without result, marked in the charts.
     finished : int, optional
         Number of all finished pairs, where `pairs` is an evenly chosen part of them. Default: all are given.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
     """
     pairs = sorted(pairs, key=lambda pair: pair.number)
     groups = group(pairs)
     failed = [failure.pair for failure in failures]
-    single, noun = bool((groups.pairs == 1).all()), naming.noun
+    single, noun = bool((groups.pairs == 1).all()), recording.noun
     parts = [
         f'<h2 id="pairs">All {noun}s</h2>',
         markup.paragraph(_overview(pairs, failed, finished or len(pairs), noun)),

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from lfpiv.experiment.recording import PAIRS, Recording
 from lfpiv.geometry.names import COMPONENTS
 from lfpiv.quantities import Scale
 from lfpiv.report import flow, markup
@@ -23,35 +24,36 @@ from lfpiv.report.line_panels import (
     uncertainty_over_depth,
 )
 from lfpiv.report.markup import number, percent, significant
-from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.slice_panels import depth_slices, slice_panel
 from lfpiv.report.space_panel import in_space
 from lfpiv.report.summary import DampingFigures
 
 
-def section(vectors: Mapping[int, pathlib.Path], naming: Naming = PAIRS, damping: DampingFigures | None = None) -> str:
+def section(
+    vectors: Mapping[int, pathlib.Path], recording: Recording = PAIRS, damping: DampingFigures | None = None
+) -> str:
     """Return the section on the flow, as HTML, with the data of its views.
 
     Parameters
     ----------
     vectors : dict
         Pair -> file of its vectors.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
     damping : DampingFigures, optional
         Damping by ghosts, if it was measured.
     """
     if not vectors:
-        return '<h2 id="vectors">Flow</h2>' + markup.paragraph(f"No {naming.noun} is finished yet.")
-    found = survey(vectors, naming)
+        return '<h2 id="vectors">Flow</h2>' + markup.paragraph(f"No {recording.noun} is finished yet.")
+    found = survey(vectors, recording)
     pair, first = next(iter(found.shown.items()))
     scale, view, kinds = flow.velocity_scale(first), flow.best_view(first), flow.describe(first)
-    data, thinning = embed(found, view, naming)
+    data, thinning = embed(found, view, recording)
     fields = flow.shown(first, kinds)
-    name = naming.result(pair)
+    name = recording.name_of(pair)
     parts = [
         '<h2 id="vectors">Flow</h2>',
-        markup.paragraph(_overview(found, len(vectors), thinning, first, naming.noun)),
+        markup.paragraph(_overview(found, len(vectors), thinning, first, recording.noun)),
         _slice_view(name, first, fields, kinds, view, scale),
         _space_view(name, fields, kinds),
         *_figures(name, first, fields, kinds, view),

@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import Normalize
 
+from lfpiv.experiment.recording import PAIRS, Recording
 from lfpiv.report import markup
 from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
-from lfpiv.report.naming import PAIRS, Naming
 from lfpiv.report.summary import PairFigures
 from lfpiv.report.svg import INK, SERIES, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
 from lfpiv.results import netcdf
@@ -24,7 +24,7 @@ BAND = (5, 95)
 """Percentiles that bound the range drawn over many volumes."""
 
 
-def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], naming: Naming = PAIRS) -> str:
+def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], recording: Recording = PAIRS) -> str:
     """Return the section on the volumes, as HTML; empty where the first file holds nothing about its volumes.
 
     Parameters
@@ -33,11 +33,11 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], naming: N
         Finished pairs.
     vectors : dict
         Pair -> file of its vectors. The volumes of the first pair are shown.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
     """
     histories = {
-        naming.volume(item.number, frame): np.asarray(residual, float)
+        recording.named(item.number, frame).label: np.asarray(residual, float)
         for item in pairs
         for frame, residual in item.residual.items()
         if residual
@@ -46,10 +46,10 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], naming: N
     first = netcdf.read_reconstruction(vectors[pair])
     if first is None:
         return ""
-    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first, naming)]
-    parts.append(quality_figure(pair, first, histories, naming))
-    parts.append(_images(pairs, naming))
-    stops = _stops(pairs, naming)
+    parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first, recording)]
+    parts.append(quality_figure(pair, first, histories, recording))
+    parts.append(_images(pairs, recording))
+    stops = _stops(pairs, recording)
     if stops:
         parts.append(
             markup.table(["volumes", "why the iteration ended"], stops, caption="Why the iterations ended", words=True)
@@ -57,9 +57,9 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], naming: N
     return "\n".join(parts)
 
 
-def _projection_figure(pair: int, first: xr.Dataset, naming: Naming) -> str:
+def _projection_figure(pair: int, first: xr.Dataset, recording: Recording) -> str:
     """Draw the largest intensity along each axis, with a table of percentiles."""
-    name = naming.volume(pair, str(first["frame"].values[0]))
+    name = recording.named(pair, str(first["frame"].values[0])).label
     names = (("z", "x", "y"), ("y", "x", "z"), ("x", "y", "z"))
     top = float(np.percentile(first["projection_z"].values[0], 99.7)) or 1.0
     shown = [_projection(first, *axes, top) for axes in names]
@@ -104,7 +104,9 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     return to_svg(figure, f"Largest intensity of the volume along {along}, over {across} and {up}.")
 
 
-def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], naming: Naming = PAIRS) -> str:
+def quality_figure(
+    pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], recording: Recording = PAIRS
+) -> str:
     """Draw the residuals and the brightness over the depth.
 
     Parameters
@@ -115,8 +117,8 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         Condensed volumes of that pair, from `netcdf.read_reconstruction`.
     histories : dict
         Volume -> residual per iteration.
-    naming : Naming
-        Names of results.
+    recording : Recording
+        What was recorded; it names results.
 
     Returns
     -------
@@ -131,10 +133,12 @@ def quality_figure(pair: int, first: xr.Dataset, histories: Mapping[str, np.ndar
         captions.append("Part of the images that the projections of the volume do not explain, per iteration of SMART.")
     profile = first["profile_z"].isel(frame=0).values
     sheet = find_sheet(first["z"].values, profile)
-    panel, table = _brightness(first, sheet, [naming.frame(pair, str(frame)) for frame in first["frame"].values])
+    panel, table = _brightness(
+        first, sheet, [recording.named(pair, str(frame)).within for frame in first["frame"].values]
+    )
     shown.append(panel)
     tables.append(table)
-    captions.append(f"Mean brightness of the planes along z, {naming.result(pair)}. {_judgement(profile, sheet)}")
+    captions.append(f"Mean brightness of the planes along z, {recording.name_of(pair)}. {_judgement(profile, sheet)}")
     return markup.figure(shown, " ".join(captions), "".join(tables))
 
 
@@ -238,14 +242,14 @@ def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
     return markup.table(titles, rows, caption="Brightness inside and outside the light sheet")
 
 
-def _images(pairs: Sequence[PairFigures], naming: Naming) -> str:
+def _images(pairs: Sequence[PairFigures], recording: Recording) -> str:
     """Tabulate medians over the images of each camera: structure, brightness and light beside the volume."""
     found: dict[str, dict[str, dict[str, float]]] = {}  # of camera, figure and volume
     for pair in pairs:
         for name in netcdf.OF_IMAGES:
             for frame, cameras in getattr(pair, name).items():
                 for camera, value in cameras.items():
-                    found.setdefault(camera, {}).setdefault(name, {})[naming.volume(pair.number, frame)] = value
+                    found.setdefault(camera, {}).setdefault(name, {})[recording.named(pair.number, frame).label] = value
     if not found:
         return ""
     rows = []
@@ -263,7 +267,7 @@ def _images(pairs: Sequence[PairFigures], naming: Naming) -> str:
     return markup.paragraph(text) + markup.table(titles, rows, caption="Quality of the images of each camera")
 
 
-def _stops(pairs: Sequence[PairFigures], naming: Naming) -> list[list[str]]:
+def _stops(pairs: Sequence[PairFigures], recording: Recording) -> list[list[str]]:
     """Count the volumes by the reason why their iteration ended."""
-    of_volume = {naming.volume(pair.number, frame): stop for pair in pairs for frame, stop in pair.stop.items()}
+    of_volume = {recording.named(pair.number, frame).label: stop for pair in pairs for frame, stop in pair.stop.items()}
     return [[f"{count:,}", reason] for reason, count in Counter(of_volume.values()).most_common()]

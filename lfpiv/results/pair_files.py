@@ -226,13 +226,6 @@ class PairFiles:
         marks = tuple(found for frame in self.frames if (found := frame.fitting()) is not None)
         return marks if len(marks) == 2 else None
 
-    def read_volumes(self) -> tuple[FrameVolume, FrameVolume] | None:
-        """Read both volumes and their records; None if one is missing or does not fit."""
-        if self.fitting_volumes() is None:
-            return None
-        first, second = (frame.read() for frame in self.frames)
-        return None if first is None or second is None else (first, second)
-
     def retire_outdated(self) -> Iterator[tuple[Path, Path]]:
         """Rename the results whose images changed; yield old and new paths."""
         results = [(self.vectors, self.stamp), *((frame.path, frame.stamp) for frame in self.frames)]
