@@ -12,11 +12,11 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
-from lfpiv.studio import results_tab
+from lfpiv.studio import images_tab, results_tab
 from lfpiv.studio.access import Places
 from lfpiv.studio.session import Session
 
-TABS = {"results": ("Results", results_tab)}
+TABS = {"images": ("Rig and images", images_tab), "results": ("Results", results_tab)}
 """Name of a tab -> its title, and the module that builds it."""
 
 ENCODED_S = 0.01
@@ -61,7 +61,14 @@ def _deliver_soon(protocol: Any) -> None:
 
 def routes(session: Session) -> list[web.RouteDef]:
     """Return the addresses beside the page, all guarded by the token."""
-    return []
+
+    async def picture(request: web.Request) -> web.Response:
+        content = session.offered.get(int(request.match_info["number"]))
+        if content is None:
+            raise web.HTTPNotFound
+        return web.Response(body=content, content_type="application/octet-stream")
+
+    return [web.get(r"/data/{number:\d+}", picture)]
 
 
 def roots_of(given: Path) -> tuple[Path, ...]:

@@ -9,10 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lfpiv.errors import InputError
 from lfpiv.studio.access import Places
 
 log = logging.getLogger(__name__)
+
+MOST_OFFERED = 24
+"""Largest number of pictures that wait to be fetched by the page."""
 
 
 @dataclass
@@ -28,6 +33,9 @@ class Session:
     listeners: list[Callable[[str], None]] = field(default_factory=list)
     """Called with "experiment" or "results" when another one is opened or it changed."""
     tasks: set[asyncio.Task[Any]] = field(default_factory=set)
+    offered: dict[int, bytes] = field(default_factory=dict)
+    """Pictures that the page fetches, by number."""
+    count: int = 0
 
     @property
     def state(self) -> Any:
@@ -74,6 +82,20 @@ class Session:
         task = asyncio.get_running_loop().create_task(watched())
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
+
+    def offer(self, picture: np.ndarray) -> dict[str, Any]:
+        """Offer a picture of counts, (rows, columns) or (rows, columns, 3), to the page; return what it fetches."""
+        self.count += 1
+        self.offered[self.count] = np.ascontiguousarray(picture, "<f4").tobytes()
+        while len(self.offered) > MOST_OFFERED:
+            self.offered.pop(next(iter(self.offered)))
+        rows, columns, *channels = picture.shape
+        return {
+            "url": f"data/{self.count}",
+            "rows": rows,
+            "columns": columns,
+            "channels": channels[0] if channels else 1,
+        }
 
     async def aside(self, function: Callable[..., Any], *given: Any) -> Any:
         """Compute in another thread and return the result."""

@@ -1,1 +1,166 @@
-window.lfpivStudio = { install() {} };
+// A picture of counts: zoomed by the wheel or + and -, moved by dragging or the arrow keys, with marks over it.
+(() => {
+  const { h, ref, watch, onMounted, onBeforeUnmount } = Vue;
+
+  const LfImage = {
+    props: { image: Object, low: Number, high: Number, marks: Array, colours: String, name: String, smooth: Boolean },
+    emits: ['point', 'pick'],
+    setup(props, { emit }) {
+      const box = ref(null), canvas = ref(null), readout = ref('');
+      let data = null, bitmap = null, view = null, drag = null, moved = 0;
+
+      async function load() {
+        const wanted = props.image;
+        if (!wanted || !wanted.url) return;
+        const answer = await fetch(wanted.url);
+        if (!answer.ok) return;
+        const values = new Float32Array(await answer.arrayBuffer());
+        if (props.image.url !== wanted.url) return;
+        const same = data && data.rows === wanted.rows && data.columns === wanted.columns;
+        data = { values, rows: wanted.rows, columns: wanted.columns, channels: wanted.channels || 1 };
+        if (!same) view = null;
+        paint();
+      }
+
+      function paint() {
+        if (!data) return;
+        const { values, rows, columns, channels } = data, count = rows * columns;
+        const pixels = new Uint8ClampedArray(4 * count), low = props.low, scale = 255 / Math.max(props.high - low, 1e-9);
+        for (let i = 0; i < count; i++) {
+          for (let c = 0; c < 3; c++) pixels[4 * i + c] = (values[channels === 1 ? i : 3 * i + c] - low) * scale;
+          pixels[4 * i + 3] = 255;
+        }
+        const scratch = document.createElement('canvas');
+        scratch.width = columns; scratch.height = rows;
+        scratch.getContext('2d').putImageData(new ImageData(pixels, columns, rows), 0, 0);
+        bitmap = scratch;
+        draw();
+      }
+
+      function fit() {
+        const { width, height } = canvas.value;
+        const scale = Math.min(width / data.columns, height / data.rows) * 0.98;
+        view = { scale, x: (width - data.columns * scale) / 2, y: (height - data.rows * scale) / 2 };
+      }
+
+      function draw() {
+        const sheet = canvas.value, frame = box.value;
+        if (!sheet || !frame) return;
+        const ratio = window.devicePixelRatio || 1;
+        const width = Math.round(frame.clientWidth * ratio), height = Math.round(frame.clientHeight * ratio);
+        if (!width || !height) return;
+        if (sheet.width !== width || sheet.height !== height) { sheet.width = width; sheet.height = height; view = null; }
+        const context = sheet.getContext('2d');
+        context.clearRect(0, 0, width, height);
+        if (!bitmap) return;
+        if (!view) fit();
+        context.imageSmoothingEnabled = !!props.smooth || view.scale < 1;
+        context.drawImage(bitmap, view.x, view.y, data.columns * view.scale, data.rows * view.scale);
+        for (const mark of props.marks || []) drawMark(context, mark);
+        sheet.dataset.drawn = Number(sheet.dataset.drawn || 0) + 1;
+      }
+
+      const at = (column, row) => [view.x + (column + 0.5) * view.scale, view.y + (row + 0.5) * view.scale];
+
+      function drawMark(context, mark) {
+        context.strokeStyle = context.fillStyle = mark.colour;
+        context.lineWidth = 1.5;
+        const size = mark.radius ? mark.radius * view.scale : 4, places = mark.places;
+        if (mark.kind === 'arrows') {
+          for (const [a, b, c, d] of places) arrow(context, ...at(a, b), ...at(c, d));
+          return;
+        }
+        if (mark.kind === 'points' && size < 1.5) context.globalAlpha = 0.6;
+        places.forEach(([column, row], number) => {
+          const [x, y] = at(column, row);
+          if (x < -20 || y < -20 || x > canvas.value.width + 20 || y > canvas.value.height + 20) return;
+          context.beginPath();
+          context.arc(x, y, Math.max(size, 1), 0, 7);
+          if (mark.kind === 'points') context.fill(); else context.stroke();
+          if (mark.names && view.scale > (mark.names_from || 0)) {
+            context.font = '12px sans-serif';
+            context.fillText(mark.names[number], x + size + 2, y - size);
+          }
+        });
+        context.globalAlpha = 1;
+      }
+
+      function arrow(context, x, y, u, v) {
+        const turn = Math.atan2(v - y, u - x), head = Math.min(9, Math.hypot(u - x, v - y) / 2);
+        context.beginPath();
+        context.moveTo(x, y); context.lineTo(u, v);
+        context.lineTo(u - head * Math.cos(turn - 0.5), v - head * Math.sin(turn - 0.5));
+        context.moveTo(u, v);
+        context.lineTo(u - head * Math.cos(turn + 0.5), v - head * Math.sin(turn + 0.5));
+        context.stroke();
+      }
+
+      function place(event) {
+        const rect = canvas.value.getBoundingClientRect(), ratio = canvas.value.width / rect.width;
+        const x = (event.clientX - rect.left) * ratio, y = (event.clientY - rect.top) * ratio;
+        return { x, y, column: (x - view.x) / view.scale - 0.5, row: (y - view.y) / view.scale - 0.5 };
+      }
+
+      function zoom(x, y, factor) {
+        view = { scale: view.scale * factor, x: x - (x - view.x) * factor, y: y - (y - view.y) * factor };
+        draw();
+      }
+
+      let waiting = null;
+      function point(spot) {
+        const column = Math.round(spot.column), row = Math.round(spot.row);
+        if (column < 0 || row < 0 || column >= data.columns || row >= data.rows) { readout.value = ''; return; }
+        const i = row * data.columns + column;
+        const value = data.channels === 1 ? data.values[i].toPrecision(5) * 1 : '';
+        readout.value = `column ${column}, row ${row}: ${value}`;
+        if (!waiting) setTimeout(() => { const [c, r] = waiting; waiting = null; emit('point', [c, r]); }, 40);
+        waiting = [spot.column, spot.row];
+      }
+
+      function move(event) {
+        if (!view || !data) return;
+        const spot = place(event);
+        if (drag) {
+          moved += Math.abs(spot.x - drag.x) + Math.abs(spot.y - drag.y);
+          view.x += spot.x - drag.x; view.y += spot.y - drag.y;
+          drag = spot;
+          draw();
+        } else point(spot);
+      }
+
+      function key(event) {
+        if (!view) return;
+        const { width, height } = canvas.value, step = 60;
+        const shift = { ArrowLeft: [step, 0], ArrowRight: [-step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
+        if (shift) { view.x += shift[0]; view.y += shift[1]; draw(); }
+        else if (event.key === '+' || event.key === '-') zoom(width / 2, height / 2, event.key === '+' ? 1.4 : 1 / 1.4);
+        else if (event.key === '0') { view = null; draw(); }
+        else return;
+        event.preventDefault();
+        point({ column: (width / 2 - view.x) / view.scale, row: (height / 2 - view.y) / view.scale });
+      }
+
+      let observer = null;
+      onMounted(() => { observer = new ResizeObserver(draw); observer.observe(box.value); load(); });
+      onBeforeUnmount(() => observer && observer.disconnect());
+      watch(() => props.image && props.image.url, load);
+      watch(() => [props.low, props.high], paint);
+      watch(() => props.marks, draw);
+      return () => h('div', { ref: box, class: 'lf-image' }, [
+        h('canvas', {
+          ref: canvas, tabindex: 0, role: 'img', 'aria-label': props.name,
+          onPointermove: move,
+          onPointerdown: (event) => { if (view) { drag = place(event); moved = 0; event.target.setPointerCapture(event.pointerId); } },
+          onPointerup: (event) => { if (drag && moved < 4) emit('pick', [place(event).column, place(event).row]); drag = null; },
+          onWheel: (event) => { event.preventDefault(); if (view) { const s = place(event); zoom(s.x, s.y, event.deltaY < 0 ? 1.25 : 0.8); } },
+          onDblclick: () => { view = null; draw(); },
+          onKeydown: key,
+        }),
+        h('div', { class: 'lf-name' }, props.name),
+        h('div', { class: 'lf-readout' }, readout.value),
+      ]);
+    },
+  };
+
+  window.lfpivStudio = { install(app) { app.component('lf-image', LfImage); } };
+})();

@@ -1,0 +1,233 @@
+"""Tab of rig and images: any image with lattice, dots and axes over it, pupil views, refocused planes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import trame_client.widgets.html as html
+from trame_client.widgets.core import AbstractElement
+
+from lfpiv.experiment.opening import read_experiment
+from lfpiv.studio import charts, controls
+from lfpiv.studio.raw_images import MOST_MARKS, RawImages
+from lfpiv.studio.session import Session
+
+LATTICE, DOT, ARROW, X_AXIS, Y_AXIS = "#37b24d", "#ffd43b", "#ff6b6b", "#ff6b6b", "#4dabf7"
+MARKED = {"saturated": "#ff922b", "hot": "#e64980"}
+
+
+class Picture(AbstractElement):
+    """Element of a picture of counts, drawn by static/studio.js."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("lf-image", **options)
+        self._attr_names += ["image", "low", "high", "marks", "name", "smooth"]
+        self._event_names += ["point", "pick"]
+
+
+def build(session: Session) -> None:
+    """Build the tab."""
+    Images(session)
+
+
+class Images:
+    """State and panel of the tab."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.state = session, session.state
+        self.raw: RawImages | None = None
+        self.image: np.ndarray | None = None
+        self.state.update(
+            {
+                "i_cameras": [], "i_camera": "", "i_names": [], "i_name": "", "i_image": None, "i_low": 0.0,
+                "i_high": 1.0,                "i_top": 1.0, "i_marks": [], "i_lattice": True, "i_dots": True, "i_pixels": True, "i_axes": True,
+                "i_facts": [], "i_chart": "", "i_u": 0.0, "i_v": 0.0, "i_radius": 1.0, "i_follow": True,
+                "i_pupil": None,                "i_pupil_high": 1.0, "i_z": 0.0, "i_depth": [-1.0, 1.0], "i_plane": None, "i_plane_high": 1.0,
+                "i_both": False, "i_busy": "", "i_source": "",
+            }
+        )  # fmt: skip
+        change = self.state.change
+        change("tab")(lambda tab, **_: tab == "images" and self._open())
+        change("i_camera")(lambda **_: self._list_names())
+        change("i_camera", "i_name")(lambda **_: self._show())
+        change("i_lattice", "i_dots", "i_pixels", "i_axes")(lambda **_: session.guarded(self._mark)())
+        change("i_u", "i_v")(lambda **_: session.guarded(self._pupil)())
+        change("i_z", "i_both")(lambda **_: session.guarded(self._refocus)())
+        session.listeners.append(self._changed)
+        self._panel()
+
+    # -- data ---------------------------------------------------------------------------------------------------------
+
+    def _changed(self, what: str) -> None:
+        """Forget what belongs to an experiment or a run that was open before."""
+        self.raw = None
+        if self.state.tab == "images":
+            self._open()
+
+    def _open(self) -> None:
+        if self.raw is None and self.session.experiment is not None and not self.state.i_busy:
+            self.session.start(self._open_aside())
+
+    async def _open_aside(self) -> None:
+        """Read the experiment beside the page."""
+        session = self.session
+        with self.state:
+            self.state.i_busy = "reading the experiment"
+        try:
+            raw = RawImages(await session.aside(read_experiment, session.experiment), session.results)
+            with self.state:
+                self.raw = raw
+                self.state.i_cameras = [setup.name for setup in raw.experiment.cameras]
+                self.state.i_camera = self.state.i_cameras[0]
+                z, grid = float(raw.experiment.grid.centre_mm[2]), raw.experiment.grid
+                half = grid.shape[0] * grid.voxel_mm / 2
+                self.state.i_depth, self.state.i_z = [z - half, z + half], z
+        finally:
+            with self.state:
+                self.state.i_busy = ""
+        with self.state:
+            self._list_names()
+            self._show()
+
+    def _list_names(self) -> None:
+        if self.raw is not None and self.state.i_camera:
+            self.state.i_names = self.raw.names(self.state.i_camera)
+            if self.state.i_name not in self.state.i_names:
+                self.state.i_name = self.state.i_names[0]
+
+    def _show(self) -> None:
+        if self.raw is not None and self.state.i_name in self.state.i_names:
+            self.session.start(self._show_aside(self.raw, self.state.i_camera, self.state.i_name))
+
+    async def _show_aside(self, raw: RawImages, camera: str, name: str) -> None:
+        """Show an image at once, and what is seen in it as soon as the camera is decoded."""
+        session = self.session
+        image = await session.aside(raw.read, camera, name)
+        with self.state:
+            if (self.state.i_camera, self.state.i_name) != (camera, name):
+                return
+            self.image = image
+            self.state.i_image = session.offer(raw.recorded(camera, image))
+            sample = image[::3, ::3]
+            self.state.i_top = float(image.max())
+            self.state.i_low, self.state.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
+            self.state.i_marks = []
+            values, counts = charts.histogram(sample)
+            self.state.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
+            self.state.i_busy = "finding the microlenses"
+        try:
+            await session.aside(raw.calibrated, camera)
+        finally:
+            with self.state:
+                self.state.i_busy = ""
+        with self.state:
+            self.state.i_radius = raw.calibrated(camera).optics.pupil_radius_mm
+            self.state.i_source = "measured by the run" if raw.measured else "nominal, not calibrated yet"
+            if (self.state.i_camera, self.state.i_name) == (camera, name):
+                self._mark()
+                self._pupil()
+                self._refocus()
+
+    def _mark(self) -> None:
+        """Put lattice, dots, axes and marked pixels over the picture."""
+        raw, image, s = self.raw, self.image, self.state
+        if raw is None or image is None or not raw.cameras:
+            return
+        camera, name = s.i_camera, s.i_name
+        marks, facts = [], [f"{image.min():.6g} to {image.max():.6g} counts, mean {image.mean():.5g}"]
+        optics = raw.calibrated(camera).optics
+        if s.i_lattice:
+            centres = raw.lattice_px(camera)
+            radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
+            marks.append(mark("circles", LATTICE, centres, radius=float(radius)))
+            facts.append(
+                f"{len(centres):,} microimages on the lattice, {optics.microimage_pitch_px:.2f} px apart (stated)"
+            )
+        found = raw.marked_pixels(camera, image)
+        for kind, places in found.items():
+            facts.append(f"{len(places):,} {kind} pixels")
+            if s.i_pixels and len(places):
+                marks.append(mark("circles", MARKED[kind], places[:MOST_MARKS], radius=2.0))
+        if s.i_dots and name.startswith("plane"):
+            places, names, arrows = raw.dots(camera, int(name.split()[1]))
+            marks.append(mark("circles", DOT, places, radius=optics.microimage_pitch_px / 2) | {"names": names})
+            marks.append(mark("arrows", ARROW, arrows))
+        if s.i_axes:
+            centre, x, y = raw.axes_px(camera)
+            for end, colour, axis in ((x, X_AXIS, "x"), (y, Y_AXIS, "y")):
+                marks.append(mark("arrows", colour, np.array([[*centre, *end]])))
+                marks.append(mark("points", colour, end[None]) | {"names": [axis]})
+        s.i_marks, s.i_facts = marks, facts
+
+    def follow(self, place: list[float]) -> None:
+        """Look through the pupil point that the pixel under the pointer sees."""
+        raw = self.raw
+        if raw is not None and raw.cameras and self.state.i_follow:
+            u, v = raw.pupil_at(self.state.i_camera, (place[0], place[1]))
+            self.state.i_u, self.state.i_v = float(f"{u:.4g}"), float(f"{v:.4g}")
+
+    def _pupil(self) -> None:
+        raw, image, s = self.raw, self.image, self.state
+        if raw is None or image is None or not raw.cameras:
+            return
+        view = raw.pupil_view(s.i_camera, image, (float(s.i_u), float(s.i_v)))
+        s.i_pupil_high = float(np.percentile(view, 99.7)) or 1.0
+        s.i_pupil = self.session.offer(view)
+
+    def _refocus(self) -> None:
+        raw, s = self.raw, self.state
+        if raw is None or self.image is None or not raw.cameras:
+            return
+        names = [camera for camera in s.i_cameras if s.i_name in raw.names(camera)]
+        shown = [s.i_camera, *(name for name in names if name != s.i_camera)] if s.i_both else [s.i_camera]
+        planes = [raw.refocused(camera, s.i_name, float(s.i_z)) for camera in shown[:2]]
+        planes = [plane / (float(np.percentile(plane, 99.7)) or 1.0) for plane in planes]
+        if len(planes) == 2:  # red and cyan: what both see is white
+            planes = [np.stack([planes[0], planes[1], planes[1]], axis=-1)]
+        s.i_plane = self.session.offer(planes[0])
+
+    # -- page ---------------------------------------------------------------------------------------------------------
+
+    def _panel(self) -> None:
+        with html.Div(classes="lf-split"):
+            with html.Div(classes="lf-panel"):
+                html.Div("Open an experiment file to see its images.", v_if="!experiment_name", classes="lf-note")
+                html.Div("{{ i_busy }} ...", v_if="i_busy", classes="lf-note", role="status")
+                controls.choice("i_camera", "camera", ("i_cameras",), id="i-camera")
+                controls.choice("i_name", "image", ("i_names",), id="i-name")
+                html.H3("Over the picture")
+                controls.switch("i_lattice", "lattice of the microlenses", id="i-lattice")
+                controls.switch("i_dots", "dots of the board, named; residuals x 50")
+                controls.switch("i_axes", "axes x and y of the volume")
+                controls.switch("i_pixels", "saturated and hot pixels")
+                html.Div("cameras: {{ i_source }}", v_if="i_source", classes="lf-note")
+                html.H3("Counts")
+                controls.slider("i_low", "black", 0, ("i_top",), ("i_top / 500",), unit="counts")
+                controls.slider("i_high", "white", 0, ("i_top",), ("i_top / 500",), unit="counts")
+                html.Div("{{ fact }}", v_for="fact in i_facts", key="fact", classes="lf-note")
+                html.Div(v_html=("i_chart",))
+                html.H3("Through one point of the pupil")
+                controls.switch("i_follow", "follows the pointer")
+                for name in "uv":
+                    controls.slider(f"i_{name}", name, ("-i_radius",), ("i_radius",), ("i_radius / 50",), unit="mm")
+                html.H3("Refocused")
+                controls.slider("i_z", "z", ("i_depth[0]",), ("i_depth[1]",), 0.01, unit="mm")
+                controls.switch("i_both", "two cameras at once: red and cyan", id="i-both")
+            with html.Div(classes="lf-main"), html.Div(classes="lf-pictures"):
+                Picture(
+                    image=("i_image",), low=("i_low",), high=("i_high",), marks=("i_marks",),
+                    name=("i_camera + ', ' + i_name",), point=(self.follow, "[$event]"), id="i-picture",
+                )  # fmt: skip
+                with html.Div(classes="lf-side"):
+                    Picture(
+                        image=("i_pupil",), low=0, high=("i_pupil_high",), id="i-pupil",
+                        name=("`through (u, v) = (${i_u}, ${i_v}) mm`",),
+                    )  # fmt: skip
+                    name = "`refocused at z = ${i_z} mm${i_both ? ': red ' + i_camera + ', cyan the other' : ''}`"
+                    Picture(image=("i_plane",), low=0, high=1, smooth=True, id="i-plane", name=(name,))
+
+
+def mark(kind: str, colour: str, places: np.ndarray, radius: float = 0.0) -> dict[str, Any]:
+    """Return marks as the page draws them: circles, points or arrows at places [pixel]."""
+    return {"kind": kind, "colour": colour, "places": np.round(places, 2).tolist(), "radius": radius}

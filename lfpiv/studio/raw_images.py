@@ -1,0 +1,234 @@
+"""Images of an experiment as recorded, and what lfpiv sees in them: lattice, dots, pupil views, refocused planes.
+
+Overlays are in pixels (column, row) of the recorded picture, before `image_flip` is undone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+import lfpiv
+from lfpiv.calibration.board.dots import DotBoard
+from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.errors import InputError
+from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.images import FLIPS
+from lfpiv.geometry.optics import spread_over_pupil
+from lfpiv.lightfield.saturation import saturated_pixels
+from lfpiv.results.folder import Folder
+
+HOT_SIGMA, HOT_RATIO = 12.0, 5.0
+"""Least height of a hot pixel: in standard deviations of the noise, and over that of its highest neighbour."""
+MOST_MARKS = 3000
+"""Largest number of pixels, dots or lenses that are marked."""
+ARROW_GAIN = 50.0
+"""Factor by which residuals of dots are drawn longer than they are."""
+REFOCUSED = 100
+"""Places along the longer side of a refocused plane."""
+PUPIL_POINTS = 19
+"""Points of the pupil whose views are summed into a refocused plane."""
+
+
+@dataclass
+class RawImages:
+    """The images of an open experiment; decoded cameras and views are kept."""
+
+    experiment: Experiment
+    results: Path | None = None
+    """Folder of a run, whose calibration is taken; without one, cameras are nominal thin lenses."""
+    cameras: dict[str, CalibratedCamera] = field(default_factory=dict)
+    measured: bool = False
+    """Whether the cameras are calibrated."""
+    grids: dict[str, np.ndarray] = field(default_factory=dict)
+    """Lattice indices of a rectangle of lenses of each camera."""
+    views: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    """Pupil views of the last images."""
+
+    def names(self, camera: str) -> list[str]:
+        """Return the names of a camera's images: white, dark, plane N, background F, and frames or instants."""
+        e = self.experiment
+        setup = e.camera(camera)
+        found = ["white", *(["dark"] if setup.dark_path else [])]
+        found += [f"plane {number}" for number in range(len(e.board.planes_mm))]
+        if setup.background is not None:
+            found += [f"background {frame}" for frame in dict.fromkeys(e.frames)]
+        if e.series is not None:
+            first = e.series.first
+            return found + [f"instant {number}" for number in range(first, first + e.series.instants)]
+        return found + [f"pair {pair} {frame}" for pair in e.numbers for frame in e.frames]
+
+    def read(self, camera: str, name: str) -> np.ndarray:
+        """Return an image as lfpiv reads it, float32 (rows, columns) [counts]."""
+        e, (kind, *rest) = self.experiment, name.split(" ", 2)
+        if name not in self.names(camera):
+            raise InputError(f"{name}: expected an image of camera {camera!r}, found no such image.")
+        if kind in ("white", "dark"):
+            image = e.white(camera) if kind == "white" else e.dark(camera)
+        elif kind == "plane":
+            image = e.board_image(camera, int(rest[0]))
+        elif kind == "background":
+            image = e.background_image(camera, rest[0])
+        elif kind == "instant":
+            number, step = int(rest[0]), e.series.step if e.series else 1
+            pair, frame = (number, 0) if number in e.numbers else (number - step, 1)
+            image = e.particle_image(camera, pair, e.frames[frame])
+        else:
+            image = e.particle_image(camera, int(rest[0]), rest[1])
+        assert image is not None
+        return image
+
+    def calibrated(self, camera: str) -> CalibratedCamera:
+        """Return a camera: that of the results, or a thin lens in its nominal place."""
+        if not self.cameras:
+            file = Folder(self.results).calibration if self.results is not None else None
+            if file is not None and file.is_file():
+                self.cameras, self.measured = dict(lfpiv.load_calibration(file).cameras), True
+            if set(self.cameras) != {setup.name for setup in self.experiment.cameras}:
+                self.cameras, self.measured = dict(lfpiv.thin_lens(self.experiment).cameras), False
+        return self.cameras[camera]
+
+    def lens_grid(self, camera: str) -> np.ndarray:
+        """Return the lattice indices of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
+        if camera not in self.grids:
+            self.grids[camera] = self.calibrated(camera).decoder.lens_grid()
+        return self.grids[camera]
+
+    def recorded(self, camera: str, array: np.ndarray) -> np.ndarray:
+        """Return an image as its camera recorded it, which undoes what reading did."""
+        return np.ascontiguousarray(array[FLIPS[self.experiment.camera(camera).image_flip]])
+
+    def recorded_px(self, camera: str, places: np.ndarray) -> np.ndarray:
+        """Return places (column, row) of a recorded picture from those of the picture as it is read, or back."""
+        setup = self.experiment.camera(camera)
+        rows, columns = setup.optics.sensor_shape
+        places, flip = np.array(places, float), FLIPS[setup.image_flip]
+        for axis, count in ((0, columns), (1, rows)):
+            if flip[1 - axis].step == -1:
+                places[..., axis] = count - 1 - places[..., axis]
+        return places
+
+    def lattice_px(self, camera: str) -> np.ndarray:
+        """Return the centres of the microimages where the lattice has them, shape (lens, 2)."""
+        found = self.calibrated(camera)
+        index = self.lens_grid(camera).reshape(-1, 2)
+        optics = found.optics
+        centres = optics.sensor_px(found.lattice.centres_mm(index) * (1 + optics.sensor_per_pupil))
+        rows, columns = optics.sensor_shape
+        inside = ((centres > -0.5) & (centres < (columns - 0.5, rows - 0.5))).all(1)
+        return self.recorded_px(camera, centres[inside])
+
+    def marked_pixels(self, camera: str, image: np.ndarray) -> dict[str, np.ndarray]:
+        """Return saturated and hot pixels of an image as it is read, each (n, 2) in the recorded picture."""
+        clipped = saturated_pixels(image, self.experiment.camera(camera).white_level)
+        around = ndimage.maximum_filter(image, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
+        noise = 1.4826 * float(np.median(np.abs(np.diff(image[:, ::7], axis=0)))) / np.sqrt(2)
+        level = float(np.percentile(image[::5, ::5], 5))
+        hot = image - level > HOT_RATIO * np.maximum(around - level, 0) + HOT_SIGMA * max(noise, 1.0)
+        return {
+            name: self.recorded_px(camera, np.argwhere(flags)[:, ::-1])
+            for name, flags in (("saturated", clipped), ("hot", hot))
+        }
+
+    def dots(self, camera: str, plane: int) -> tuple[np.ndarray, list[str], np.ndarray]:
+        """Return where the dots of a plane lie, what they are called, and their residual arrows.
+
+        Returns
+        -------
+        places : ndarray, shape (dot, 2)
+            (column, row) of each dot's light through the middle of the pupil, as the mapping has it [pixel].
+        names : list of str
+            Column and row of the dot on the board.
+        arrows : ndarray, shape (n, 4)
+            From a measured dot's predicted place, `ARROW_GAIN` times its residual [pixel].
+        """
+        found, board = self.calibrated(camera), DotBoard.from_settings(self.experiment.board)
+        numbers = plane * board.size + np.flatnonzero(board.occupied)
+        middle = np.zeros((len(numbers), 2))
+        chief = found.map(board.of_dots_mm(numbers), middle)
+        scale = 1 + found.optics.sensor_per_pupil
+        places = found.optics.sensor_px(chief * scale)
+        across = self.experiment.board.dots[0]
+        names = [f"{number % board.size % across},{number % board.size // across}" for number in numbers]
+        arrows = np.zeros((0, 4))
+        if found.dots is not None:
+            here = np.isin(found.dots.measured_dot, numbers)
+            rank = np.searchsorted(numbers, found.dots.measured_dot[here])
+            seen = found.optics.sensor_px(found.dots.chief_mm[here] * scale)
+            ends = places[rank] + ARROW_GAIN * (seen - places[rank])
+            arrows = np.hstack([self.recorded_px(camera, places[rank]), self.recorded_px(camera, ends)])
+        return self.recorded_px(camera, places), names, arrows
+
+    def axes_px(self, camera: str) -> np.ndarray:
+        """Return where the volume's centre and steps along x and y from it lie, shape (3, 2) [pixel]."""
+        found, grid = self.calibrated(camera), self.experiment.grid
+        reach = 0.3 * min(n * grid.voxel_mm for n in grid.shape[1:])
+        points = grid.centre_mm + reach * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        chief = found.map(points, np.zeros((3, 2)))
+        return self.recorded_px(camera, found.optics.sensor_px(chief * (1 + found.optics.sensor_per_pupil)))
+
+    def pupil_at(self, camera: str, place: tuple[float, float]) -> tuple[float, float]:
+        """Return the pupil point (u, v) that a pixel of the recorded picture sees [mm]."""
+        found = self.calibrated(camera)
+        column, row = self.recorded_px(camera, np.array(place))
+        rows, columns = found.optics.sensor_shape
+        at = (int(np.clip(round(row), 0, rows - 1)), int(np.clip(round(column), 0, columns - 1)))
+        u, v = found.decoder.pupil_mm[at]
+        radius = found.optics.pupil_radius_mm
+        shrink = min(1.0, 0.95 * radius / max(float(np.hypot(u, v)), 1e-9))
+        return float(u) * shrink, float(v) * shrink
+
+    def pupil_view(self, camera: str, image: np.ndarray, pupil_mm: tuple[float, float]) -> np.ndarray:
+        """Return the scene as it is seen through a pupil point: a value for each lens; 0 where none is seen."""
+        found = self.calibrated(camera)
+        level = float(np.percentile(image[::5, ::5], 20))
+        values = found.decoder.sample(image - np.float32(level), self.lens_grid(camera), pupil_mm)
+        return self._upright(camera, np.nan_to_num(values))
+
+    def _upright(self, camera: str, values: np.ndarray) -> np.ndarray:
+        """Turn an array over the lenses (i, j) so that it lies as the recorded picture."""
+        basis = np.asarray(self.calibrated(camera).lattice.basis_mm)
+        along = values.T if abs(basis[0][0]) >= abs(basis[0][1]) else values
+        return self.recorded(camera, along)
+
+    def refocused(self, camera: str, name: str, z_mm: float) -> np.ndarray:
+        """Return the light that comes from a plane of the volume, x to the right and y up; 0 where none is seen.
+
+        The light of `PUPIL_POINTS` pupil views is summed along the rays of the camera.
+        """
+        found, grid = self.calibrated(camera), self.experiment.grid
+        pupil = spread_over_pupil(0.9 * found.optics.pupil_radius_mm)[:PUPIL_POINTS]
+        stack = self._stack(camera, name, pupil)
+        ny, nx = grid.shape[1:]
+        step = max(nx, ny) * grid.voxel_mm / REFOCUSED
+        x = grid.centre_mm[0] + (np.arange(round(nx * grid.voxel_mm / step)) + 0.5) * step - nx * grid.voxel_mm / 2
+        y = grid.centre_mm[1] - (np.arange(round(ny * grid.voxel_mm / step)) + 0.5) * step + ny * grid.voxel_mm / 2
+        points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z_mm)], axis=-1).reshape(-1, 3)
+        origin, basis = np.asarray(found.lattice.origin_mm), np.linalg.inv(np.asarray(found.lattice.basis_mm))
+        low = self.lens_grid(camera)[0, 0].astype(float)
+        total, seen = np.zeros(len(points)), np.zeros(len(points))
+        fan = found.map_fan(points, pupil)
+        for number in range(len(pupil)):
+            at = (fan[:, number] - origin) @ basis - low
+            value = ndimage.map_coordinates(stack[number], at.T, order=1, cval=np.nan, prefilter=False)
+            known = np.isfinite(value)
+            total[known] += value[known]
+            seen += known
+        return (
+            np.divide(total, seen, out=np.zeros_like(total), where=seen > 0).reshape(len(y), len(x)).astype(np.float32)
+        )
+
+    def _stack(self, camera: str, name: str, pupil: np.ndarray) -> np.ndarray:
+        """Return the pupil views of an image, shape (point, i, j); those of the last images are kept."""
+        key = (camera, name)
+        if key not in self.views:
+            while len(self.views) > 3:
+                self.views.pop(next(iter(self.views)))
+            image, found = self.read(camera, name), self.calibrated(camera)
+            signal = image - np.float32(found.decoder.background(image)[0])
+            index = self.lens_grid(camera)
+            self.views[key] = np.stack([found.decoder.sample(signal, index, point) for point in pupil])
+        return self.views[key]
