@@ -1,107 +1,27 @@
 """Tables that cannot rot: keys of experiment and scene files, options of the command line, sentences of the warnings.
 
-`key_rows`, `commands`, `help_text` and `warning_rows` need no Sphinx; `setup` registers the directives ``{keys}``,
+`commands`, `help_text` and `warning_rows` need no Sphinx; `setup` registers the directives ``{keys}``,
 ``{command}`` and ``{warning-list}``.
 """
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import importlib
-import inspect
 import io
-import itertools
-import json
 import os
 import re
-import textwrap
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
+
+from lfpiv.settings.keys import key_rows
 
 
 def find(name: str) -> type[BaseModel]:
     """Return a model by its dotted name."""
     module, _, attribute = name.rpartition(".")
     return getattr(importlib.import_module(module), attribute)
-
-
-def key_rows(model: type[BaseModel]) -> list[tuple[str, str, str, str]]:
-    """Key, what it may be, default and meaning of each field of a model that holds a value, no table."""
-    schema, meanings = model.model_json_schema(), field_meanings(model)
-    rows = []
-    for name, field in model.model_fields.items():
-        entry = schema["properties"][name]
-        if _is_table(entry, schema["$defs"] if "$defs" in schema else {}):
-            continue
-        rows.append((name, _range(entry, schema.get("$defs", {})), _default(field), meanings.get(name, "")))
-    return rows
-
-
-def field_meanings(model: type[BaseModel]) -> dict[str, str]:
-    """Texts below the fields of a model and of the models it derives from."""
-    meanings = {}
-    for parent in reversed(model.__mro__):
-        if not (isinstance(parent, type) and issubclass(parent, BaseModel)) or parent is BaseModel:
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(parent))).body[0].body
-        for field, text in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                meanings[field.target.id] = " ".join(inspect.cleandoc(text.value.value).split())
-    return meanings
-
-
-def _resolved(entry: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    return definitions[entry["$ref"].rpartition("/")[2]] if "$ref" in entry else entry
-
-
-def _is_table(entry: dict[str, Any], definitions: dict[str, Any]) -> bool:
-    entry = _resolved(entry, definitions)
-    parts = [*entry.get("anyOf", []), *entry.get("oneOf", [])]
-    if isinstance(entry.get("items"), dict):
-        parts.append(entry["items"])
-    return entry.get("type") == "object" or any(_is_table(part, definitions) for part in parts)
-
-
-def _range(entry: dict[str, Any], definitions: dict[str, Any]) -> str:
-    """Say in words what a JSON schema allows."""
-    entry = _resolved(entry, definitions)
-    if "anyOf" in entry:
-        parts = [_range(part, definitions) for part in entry["anyOf"] if part.get("type") != "null"]
-        return " or ".join(dict.fromkeys(parts))
-    if "enum" in entry:
-        return " or ".join(f"`{json.dumps(value)}`" for value in entry["enum"])
-    if "const" in entry:
-        return f"`{json.dumps(entry['const'])}`"
-    if entry.get("type") == "array":
-        return _list_range(entry, definitions)
-    words = {"number": "number", "integer": "whole number", "boolean": "`true` or `false`", "string": "text"}
-    text = words[entry["type"]]
-    bounds = [
-        f"{sign} {entry[key]:g}"
-        for key, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤"))
-        if key in entry
-    ]
-    return " ".join([text, ", ".join(bounds)]) if bounds else text
-
-
-def _list_range(entry: dict[str, Any], definitions: dict[str, Any]) -> str:
-    if "prefixItems" in entry:
-        items = [_range(item, definitions) for item in entry["prefixItems"]]
-        return f"[{', '.join(items)}]" if len(set(items)) > 1 else f"{len(items)} values, each {items[0]}"
-    least = entry.get("minItems", 0)
-    return f"list of {least} or more, each {_range(entry['items'], definitions)}"
-
-
-def _default(field: Any) -> str:
-    if field.is_required():
-        return "required"
-    value = field.default if field.default is not PydanticUndefined else field.default_factory()
-    if value is None:
-        return "absent"
-    return f"`{json.dumps(value)}`"
 
 
 def commands() -> dict[str, Any]:

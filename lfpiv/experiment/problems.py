@@ -59,6 +59,13 @@ def explain(error: ValidationError, model: type[BaseModel], values: Mapping[str,
     return explained + (f" Also look at: {_listed(others, SHOWN_KEYS, values)}." if others else "")
 
 
+def explain_each(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> dict[Location, str]:
+    """Return what is wrong at each place of a file. Parameters as for `explain`."""
+    absent = "this key is missing. Add it."
+    places = _places(error, values)
+    return {place.location: absent if place.is_missing_key else place.expectation(model) for place in places}
+
+
 @dataclass(frozen=True)
 class _Place:
     """A place of the file and its problems, one for each form that the value could have."""

@@ -41,10 +41,10 @@ class Images:
         self.state.update(
             {
                 "i_cameras": [], "i_camera": "", "i_names": [], "i_name": "", "i_image": None, "i_low": 0.0,
-                "i_high": 1.0,                "i_top": 1.0, "i_marks": [], "i_lattice": True, "i_dots": True, "i_pixels": True, "i_axes": True,
-                "i_facts": [], "i_chart": "", "i_u": 0.0, "i_v": 0.0, "i_radius": 1.0, "i_follow": True,
-                "i_pupil": None,                "i_pupil_high": 1.0, "i_z": 0.0, "i_depth": [-1.0, 1.0], "i_plane": None, "i_plane_high": 1.0,
-                "i_both": False, "i_busy": "", "i_source": "",
+                "i_high": 1.0, "i_top": 1.0, "i_marks": [], "i_lattice": True, "i_dots": True, "i_pixels": True,
+                "i_axes": True, "i_facts": [], "i_chart": "", "i_u": 0.0, "i_v": 0.0, "i_radius": 1.0,
+                "i_follow": True, "i_pupil": None, "i_pupil_high": 1.0, "i_z": 0.0, "i_depth": [-1.0, 1.0],
+                "i_plane": None, "i_both": False, "i_busy": "", "i_source": "",
             }
         )  # fmt: skip
         change = self.state.change
@@ -61,6 +61,8 @@ class Images:
 
     def _changed(self, what: str) -> None:
         """Forget what belongs to an experiment or a run that was open before."""
+        if what not in ("experiment", "results", "saved"):
+            return
         self.raw = None
         if self.state.tab == "images":
             self._open()

@@ -13,6 +13,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.studio.access import Places
+from lfpiv.studio.draft import Draft
 
 log = logging.getLogger(__name__)
 
@@ -30,8 +31,10 @@ class Session:
     """The experiment file."""
     results: Path | None = None
     """Folder of a run, or a store."""
+    draft: Draft | None = None
+    """The experiment file as it is edited."""
     listeners: list[Callable[[str], None]] = field(default_factory=list)
-    """Called with "experiment" or "results" when another one is opened or it changed."""
+    """Called with "experiment" or "results" for others that are opened, "saved", "draft" or "typed" for the draft."""
     tasks: set[asyncio.Task[Any]] = field(default_factory=set)
     offered: dict[int, bytes] = field(default_factory=dict)
     """Pictures that the page fetches, by number."""
@@ -46,6 +49,10 @@ class Session:
         """Tell all tabs that the experiment or the results changed."""
         self.state.experiment_name = self.places.name(self.experiment) if self.experiment else ""
         self.state.results_name = self.places.name(self.results) if self.results else ""
+        self.told(what)
+
+    def told(self, what: str) -> None:
+        """Call the listeners."""
         for listener in self.listeners:
             self.guarded(listener)(what)
 

@@ -1,0 +1,227 @@
+"""The experiment file as it is edited: values are replaced in its text, comments and order stay."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import tomlkit
+from pydantic import BaseModel, ValidationError
+
+from lfpiv.errors import InputError
+from lfpiv.experiment import problems
+from lfpiv.experiment.opening import check_tables
+from lfpiv.experiment.toml import parse, read_text
+from lfpiv.files import write_text
+from lfpiv.settings.experiment import ExperimentTable
+from lfpiv.settings.keys import key_rows, unit_of
+from lfpiv.settings.volume import Box, HalfSpace
+
+Location = tuple[int | str, ...]
+
+OPTIONAL = ("tracking",)
+"""Tables that change what a run does by being there, even when they are empty."""
+
+
+class Draft:
+    """The text of an experiment file, with what is wrong in it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.read = read_text(path)
+        parse(self.read, path)
+        self.document = tomlkit.parse(self.read)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The values, as plain Python."""
+        return self.document.unwrap()
+
+    @property
+    def text(self) -> str:
+        """The text of the file."""
+        return tomlkit.dumps(self.document)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the text differs from the file as it was read."""
+        return self.text != self.read
+
+    def get(self, location: Sequence[int | str]) -> Any:
+        """Return the value at a place, or None where there is none."""
+        value: Any = self.values
+        for part in location:
+            try:
+                value = value[part]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return value
+
+    def set(self, location: Sequence[int | str], value: Any) -> None:
+        """Replace a value, or remove the key for None. A missing table is added at the end of the file."""
+        table: Any = self.document
+        for part in location[:-1]:
+            if isinstance(part, str) and part not in table:
+                if value is None:
+                    return
+                table[part] = tomlkit.table()
+            table = table[part]
+        key = location[-1]
+        if value is None:
+            if key in table:
+                del table[key]
+        elif key in table and not isinstance(value, list | dict):
+            comment = table[key].trivia if hasattr(table[key], "trivia") else None
+            item = tomlkit.item(value)
+            if comment is not None:
+                item.trivia.comment_ws, item.trivia.comment = comment.comment_ws, comment.comment
+            table[key] = item
+        else:
+            old = table[key] if key in table else None
+            item = tomlkit.item(value)
+            if old is not None and hasattr(old, "trivia") and hasattr(item, "trivia"):
+                item.trivia.comment_ws, item.trivia.comment = old.trivia.comment_ws, old.trivia.comment
+            table[key] = item
+
+    def write(self, location: Sequence[int | str], text: str, plain: bool) -> None:
+        """Replace a value by a text that a person typed: TOML, or words without quotes; nothing removes the key."""
+        text = text.strip()
+        if not text:
+            self.set(location, None)
+            return
+        value: Any = text
+        if not plain:
+            try:
+                value = tomlkit.parse(f"value = {text}\n").unwrap()["value"]
+            except Exception:  # not TOML: taken as words, and refused by the settings where they want a number
+                value = text
+        self.set(location, value)
+
+    def add_solid(self, kind: str, where: dict[str, Any]) -> None:
+        """Add a solid to the volume."""
+        volume: Any = self.document["volume"]
+        if "solid" not in volume:
+            volume.add("solid", tomlkit.aot())
+        table = tomlkit.table()
+        for key, value in {"kind": kind, **where}.items():
+            table.add(key, value)
+        volume["solid"].append(table)
+
+    def remove(self, location: Sequence[int | str]) -> None:
+        """Remove an entry of a list of tables, such as a camera or a solid."""
+        table: Any = self.document
+        for part in location[:-1]:
+            table = table[part]
+        del table[location[-1]]
+
+    def add_camera(self) -> None:
+        """Add a camera with the values of the last one, under another name."""
+        cameras: Any = self.document["camera"]
+        copy = tomlkit.table()
+        names = {camera["name"] for camera in cameras}
+        for key, value in cameras[-1].unwrap().items():
+            copy.add(key, value)
+        copy["name"] = next(name for n in range(1, 100) if (name := f"camera{n}") not in names)
+        cameras.append(copy)
+
+    def problems(self) -> dict[str, str]:
+        """Return what is wrong at each place, by its dotted name; "" for the file as a whole."""
+        values = self.values
+        try:
+            table = ExperimentTable.model_validate(values)
+        except ValidationError as error:
+            found = problems.explain_each(error, ExperimentTable, values)
+            return {dotted(location): text for location, text in found.items()}
+        try:
+            check_tables(self.path, table)
+        except InputError as error:
+            return {"": str(error).removeprefix(f"{self.path}: ")}
+        return {}
+
+    def save(self) -> None:
+        """Write the file.
+
+        Raises
+        ------
+        InputError
+            If a value is wrong, or the file was changed by another program since it was read.
+        """
+        wrong = self.problems()
+        if wrong:
+            raise InputError(f"{self.path}: not saved. {next(f'{key}: {text}' for key, text in wrong.items())}")
+        if read_text(self.path) != self.read:
+            raise InputError(f"{self.path}: another program changed the file since it was opened. Open it again.")
+        text = self.text
+        parse(text, self.path)
+        write_text(text, self.path)
+        self.read = text
+
+    def tables(self) -> list[dict[str, Any]]:
+        """Return what a form of the file needs: tables, and for each key its range, unit, default and meaning."""
+        found = [_form("", ExperimentTable, "experiment")]
+        for name, field in ExperimentTable.model_fields.items():
+            model = _model_of(field.annotation)
+            if model is None:
+                continue
+            if name == "camera":
+                found += [
+                    _form(f"camera.{number}", model, f"camera {camera.get('name', number)}")
+                    for number, camera in enumerate(self.values.get("camera", []))
+                ]
+            else:
+                found.append(_form(name, model, name.replace("_", " ")))
+            if name == "volume":
+                for number, solid in enumerate(self.values.get("volume", {}).get("solid", [])):
+                    shape = HalfSpace if solid.get("kind") == "half_space" else Box
+                    found.append(_form(f"volume.solid.{number}", shape, f"solid {number}: {shape.__name__}"))
+        return found
+
+    def texts(self) -> dict[str, str]:
+        """Return the text of each value by its dotted name; "" where the file does not state it."""
+        return {row["id"]: self.shown(row["id"], row["plain"]) for table in self.tables() for row in table["rows"]}
+
+    def shown(self, name: str, plain: bool) -> str:
+        """Return the text of a value as a person types it."""
+        value = self.get(location_of(name))
+        if value is None:
+            return ""
+        return str(value) if plain or isinstance(value, str) else tomlkit.item(value).as_string().strip()
+
+
+def dotted(location: Sequence[int | str]) -> str:
+    """Return the dotted name of a place; a place inside a list is that of the list."""
+    return ".".join(str(part) for part in location)
+
+
+def location_of(name: str) -> Location:
+    """Return the place of a dotted name."""
+    return tuple(int(part) if part.isdigit() else part for part in name.split(".") if part)
+
+
+def _model_of(annotation: Any) -> type[BaseModel] | None:
+    """Return the model in an annotation of a table or a list of tables; None for a value."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((model for one in get_args(annotation) if (model := _model_of(one)) is not None), None)
+
+
+@functools.cache
+def _rows(model: type[BaseModel]) -> tuple[dict[str, Any], ...]:
+    """Return what a form needs of the keys of a table."""
+    properties = model.model_json_schema()["properties"]
+    rows = []
+    for key, allowed, default, meaning in key_rows(model):
+        entry = properties[key]
+        options = entry.get("enum") or (["true", "false"] if entry.get("type") == "boolean" else [])
+        row = {"key": key, "unit": unit_of(key), "allowed": allowed.replace("`", ""), "default": default.strip("`")}
+        rows.append(
+            row | {"meaning": meaning.replace("`", ""), "options": options, "plain": entry.get("type") == "string"}
+        )
+    return tuple(rows)
+
+
+def _form(path: str, model: type[BaseModel], title: str) -> dict[str, Any]:
+    rows = [{**row, "id": f"{path}.{row['key']}" if path else row["key"]} for row in _rows(model)]
+    return {"path": path, "title": title, "rows": rows, "optional": path in OPTIONAL}

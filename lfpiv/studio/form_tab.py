@@ -1,0 +1,162 @@
+"""Tab of the experiment file as a form: each key with unit, range, default and meaning; mistakes beside the field."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+import trame_client.widgets.html as html
+from trame.widgets import vuetify3 as v3
+
+from lfpiv.experiment.opening import open_experiment
+from lfpiv.studio import controls
+from lfpiv.studio.draft import Draft, location_of
+from lfpiv.studio.session import Session
+
+WRITE = "x_texts = {...x_texts, [row.id]: $event.target.value}; trigger('x_write', [row.id, $event.target.value])"
+"""What the page does when a field changes."""
+
+
+def build(session: Session) -> None:
+    """Build the tab."""
+    Form(session)
+
+
+class Form:
+    """State and page of the tab."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.state = session, session.state
+        self.state.update(
+            {"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_changed": False, "x_diff": "", "x_files": []}
+        )
+        self.state.update({"x_open": "", "x_checked": "", "x_shown": [0]})
+        self.state.change("x_open")(lambda x_open, **_: x_open and session.guarded(self._choose)(x_open))
+        self.plain: set[str] = set()
+        session.server.trigger("x_write")(session.guarded(self.write))
+        session.listeners.append(self._changed)
+        self._page()
+
+    def _choose(self, path: str) -> None:
+        found = self.session.places.within(path)
+        if found != self.session.experiment:
+            self.session.experiment = found
+            self.session.changed("experiment")
+
+    def _changed(self, what: str) -> None:
+        """Read the file again after another one was opened; show it again after another tab changed the draft."""
+        session = self.session
+        if what == "experiment":
+            session.draft = Draft(session.experiment) if session.experiment is not None else None
+            places = session.places
+            self.state.x_files = [{"title": places.name(path), "value": str(path)} for path in places.experiments()]
+            self.state.x_open = str(session.experiment or "")
+        if what in ("experiment", "draft"):
+            self._show(anew=True)
+
+    def _show(self, *, anew: bool) -> None:
+        """Show the draft; `anew` replaces the texts of all fields."""
+        draft, s = self.session.draft, self.state
+        if draft is None:
+            s.x_tables = []
+            return
+        if anew:
+            s.x_tables, s.x_texts = draft.tables(), draft.texts()
+            self.plain = {row["id"] for table in s.x_tables for row in table["rows"] if row["plain"]}
+        s.x_wrong = draft.problems()
+        s.x_changed = draft.changed
+        lines = difflib.unified_diff(draft.read.splitlines(), draft.text.splitlines(), "file", "form", lineterm="", n=1)
+        s.x_diff = "\n".join(lines)
+
+    def write(self, name: str, text: str) -> None:
+        """Take what was typed into a field."""
+        draft = self.session.draft
+        if draft is None:
+            return
+        draft.write(location_of(name), str(text), name in self.plain)
+        self._show(anew=False)
+        self.session.told("typed")
+
+    def edit(self, what: str, place: str = "") -> None:
+        """Add or remove a camera, a solid or an optional table, undo all, or save."""
+        draft = self.session.draft
+        if draft is None:
+            return
+        if what == "camera":
+            draft.add_camera()
+        elif what == "remove":
+            draft.remove(location_of(place))
+        elif what == "table":
+            if draft.get((place,)) is None:
+                draft.set((place,), {})
+            else:
+                draft.set((place,), None)
+        elif what == "undo":
+            self.session.draft = Draft(draft.path)
+        elif what == "save":
+            draft.save()
+            self.session.start(self._check())
+            self.session.changed("saved")
+        self._show(anew=True)
+        self.session.told("typed")
+
+    async def _check(self) -> None:
+        """Open the experiment as a run does, and say what it finds."""
+        with self.state:
+            self.state.x_checked = "saved; checking the images ..."
+        try:
+            experiment = await self.session.aside(open_experiment, self.session.experiment)
+            text = f"saved; complete: {experiment.pairs} pairs of {len(experiment.cameras)} cameras"
+        except ValueError as error:
+            text = f"saved; not complete yet: {error}"
+        with self.state:
+            self.state.x_checked = text
+
+    # -- page ---------------------------------------------------------------------------------------------------------
+
+    def _page(self) -> None:
+        edit = self.session.guarded(self.edit)
+        with html.Div(classes="lf-form"):
+            with html.Div(classes="lf-bar"):
+                controls.choice("x_open", "experiment file", ("x_files",), id="x-open", classes="lf-wide")
+                controls.button("Save", (edit, "['save']"), "mdi-content-save", disabled=("!x_changed",), id="x-save")
+                controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",))
+                controls.button("Add a camera", (edit, "['camera']"), "mdi-camera-plus")
+            html.Div("{{ x_wrong[''] }}", v_if="x_wrong['']", classes="lf-wrong", role="alert")
+            html.Div("{{ x_checked }}", v_if="x_checked", classes="lf-note", role="status")
+            with v3.VExpansionPanels(multiple=True, v_model=("x_shown",), variant="accordion"):
+                with v3.VExpansionPanel(v_for="table in x_tables", key="table.path + table.title"):
+                    with v3.VExpansionPanelTitle():
+                        html.Span("{{ table.title }}")
+                        wrong = "table.rows.filter((row) => x_wrong[row.id]).length"
+                        v3.VChip(
+                            f"{{{{ {wrong} }}}} to mend", v_if=wrong, color="error", size="x-small", classes="ml-2"
+                        )
+                    with v3.VExpansionPanelText():
+                        self._table(edit)
+            html.H3("What will be written", v_if="x_changed")
+            html.Pre("{{ x_diff }}", v_if="x_changed", classes="lf-diff")
+
+    def _table(self, edit: Any) -> None:
+        removable = "table.path.startsWith('camera.') || table.path.startsWith('volume.solid.')"
+        controls.button("Remove", (edit, "['remove', table.path]"), v_if=removable)
+        with html.Div(v_if="table.optional", classes="lf-buttons"):
+            controls.button("Use or leave out this table", (edit, "['table', table.path]"))
+        with html.Div(v_for="row in table.rows", key="row.id", classes="lf-field"):
+            html.Label("{{ row.key }}{{ row.unit ? ' [' + row.unit + ']' : '' }}", raw_attrs=[":for=\"'x-' + row.id\""])
+            with html.Select(
+                v_if="row.options.length", raw_attrs=[":id=\"'x-' + row.id\"", ':value="x_texts[row.id]"'],
+                change=WRITE,
+            ):  # fmt: skip
+                html.Option("{{ row.default }} (default)", value="")
+                html.Option("{{ one }}", v_for="one in row.options", raw_attrs=[':value="one"'])
+            html.Input(
+                v_else=True, input=WRITE,
+                raw_attrs=[
+                    ":id=\"'x-' + row.id\"", ':value="x_texts[row.id]"', ':placeholder="row.default"',
+                    'spellcheck="false"',
+                    ":aria-invalid=\"x_wrong[row.id] ? 'true' : 'false'\"",
+                ],
+            )  # fmt: skip
+            html.Div("{{ x_wrong[row.id] }}", v_if="x_wrong[row.id]", classes="lf-wrong", role="alert")
+            html.Div("{{ row.meaning }} {{ row.allowed }}; default: {{ row.default }}", classes="lf-note")
