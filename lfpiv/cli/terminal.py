@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +30,11 @@ LOG_EVERY_S = 10.0
 """Shortest time between log lines of a step without a terminal [s]."""
 LEAST_FRACTION = 0.02
 """Smallest finished fraction of a step for an estimate of its remaining time."""
+
+PROGRESS_FILE = "LFPIV_PROGRESS_FILE"
+"""Variable of the environment that names a file to which progress is appended as lines of JSON. The studio reads it."""
+RECORD_EVERY_S = 0.2
+"""Shortest time between two such lines of a step [s]."""
 
 LISTED_PAIRS = 20
 """Largest number of pairs listed at the end of a run."""
@@ -79,7 +85,7 @@ class Output:
                 with _bars(console) as update:
                     yield update
             else:
-                yield _log_lines()
+                yield _recorded(_log_lines(), os.environ.get(PROGRESS_FILE))
         finally:
             for logger in loggers:
                 logger.removeHandler(handler)
@@ -141,6 +147,23 @@ def _log_lines() -> Progress:
             last[step] = now
 
     return update
+
+
+def _recorded(update: Progress, path: str | None) -> Progress:
+    """Return a progress that is also appended to a file, if one is named."""
+    if not path:
+        return update
+    last: dict[str, float] = {}
+
+    def both(step: str, fraction: float) -> None:
+        update(step, fraction)
+        now = time.time()
+        if fraction >= 1 or now - last.get(step, 0.0) >= RECORD_EVERY_S:
+            last[step] = now
+            with contextlib.suppress(OSError), open(path, "a", encoding="utf-8") as file:
+                file.write(json.dumps({"step": step, "fraction": round(fraction, 4), "at": round(now, 2)}) + "\n")
+
+    return both
 
 
 def parse_pairs(text: str) -> tuple[int, int | None]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import logging
+import os
+import signal
 import sys
 import webbrowser
 from collections.abc import Callable
@@ -88,18 +90,29 @@ def serve(
     server.controller.on_server_ready.add(started)
     arguments, sys.argv = sys.argv, sys.argv[:1]  # trame reads them
     try:
-        asyncio.run(_run(server, port))
+        asyncio.run(_run(session, port))
     except OSError as error:
         raise InputError(f"port {port}: {(error.strerror or str(error)).lower()}. Choose another --port.") from None
     finally:
         sys.argv = arguments
 
 
-async def _run(server: Any, port: int) -> None:
-    await server.start(
+async def _run(session: Any, port: int) -> None:
+    """Serve until a signal comes. Then runs are closed or left, and the process ends whatever its threads read."""
+
+    def end() -> None:
+        for close in session.closers:
+            close()
+        sys.stdout.flush()
+        os._exit(0)
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, end)
+    await session.server.start(
         port=port,
         host="127.0.0.1",
         exec_mode="coroutine",
+        thread=True,  # no handlers of signals besides those above
         open_browser=False,
         show_connection_info=False,
         disable_logging=True,

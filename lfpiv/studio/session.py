@@ -35,6 +35,8 @@ class Session:
     """The experiment file as it is edited."""
     listeners: list[Callable[[str], None]] = field(default_factory=list)
     """Called with "experiment" or "results" for others that are opened, "saved", "draft" or "typed" for the draft."""
+    closers: list[Callable[[], None]] = field(default_factory=list)
+    """Called when the studio ends."""
     tasks: set[asyncio.Task[Any]] = field(default_factory=set)
     offered: dict[int, bytes] = field(default_factory=dict)
     """Pictures that the page fetches, by number."""

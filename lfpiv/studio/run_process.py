@@ -1,0 +1,199 @@
+"""The process of a run, `lfpiv run`, which lives on without the studio: start, pause, resume, stop, and its reports.
+
+Beside its results a run that the studio starts leaves its log, `.run.log`, and its progress, `.run.jsonl`. A run that a
+terminal started is known by its lock alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lfpiv.cli.terminal import PROGRESS_FILE
+from lfpiv.errors import InputError
+from lfpiv.quantities import duration
+from lfpiv.records import RecordError, read_object, read_text
+from lfpiv.results.folder import Folder, make_writable
+
+LOG, PROGRESS = ".run.log", ".run.jsonl"
+PAIR_STEPS = ("image pairs", "instants")
+REPORT_S = 20.0
+"""Time that the report of a run takes [s]."""
+LEAST_FRACTION = 0.02
+"""Smallest finished fraction of a step from which its remaining time is told."""
+SHOWN_LINES = 60
+"""Lines of the log that are shown."""
+LARGEST_BYTES = 1 << 20
+"""Bytes at the end of log and progress that are read."""
+
+
+@dataclass(frozen=True)
+class Holder:
+    """The process that writes into a folder of results."""
+
+    process: int
+    since: str
+
+
+def holder(out: Path) -> Holder | None:
+    """Return the process of this machine that holds a folder, or None."""
+    try:
+        found = read_object(read_text(Folder(out).lock))
+        process = int(found["process"])
+        if found["host"] != socket.gethostname():
+            return None
+        os.kill(process, 0)
+    except (OSError, RecordError, KeyError, TypeError, ValueError):
+        return None
+    return Holder(process, str(found.get("since", ""))[:40])
+
+
+def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
+    """Start `lfpiv run` in a session of its own; return its process.
+
+    Raises
+    ------
+    InputError
+        If another run holds the folder, or it cannot be written.
+    """
+    if (other := holder(out)) is not None:
+        raise InputError(
+            f"{out}: expected a folder that no other run writes to, found it held by process {other.process} since "
+            f"{other.since}. Wait for its end, stop it, or choose another folder."
+        )
+    make_writable(out)
+    for name in (LOG, PROGRESS):
+        (out / name).unlink(missing_ok=True)
+    command = [sys.executable, "-m", "lfpiv", "run", str(experiment), "--out", str(out), *options]
+    with (out / LOG).open("wb") as log:
+        log.write(("$ lfpiv " + " ".join(command[3:]) + "\n").encode(errors="replace"))
+        log.flush()
+        process = subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
+            env={**os.environ, PROGRESS_FILE: str(out / PROGRESS)}, cwd=experiment.parent,
+        )  # fmt: skip
+    _children.append(process)
+    return process.pid
+
+
+_children: list[subprocess.Popen[bytes]] = []
+"""Runs that this studio started: they are asked for their status, or they stay as zombies."""
+
+
+def status(process: int) -> str:
+    """Return "running", "paused" or "ended"."""
+    for child in _children:
+        child.poll()
+    try:
+        state = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
+    except OSError:
+        try:
+            os.kill(process, 0)
+        except OSError:
+            return "ended"
+        return "running"
+    return {"T": "paused", "t": "paused", "Z": "ended", "X": "ended"}.get(state, "running")
+
+
+def exit_status(process: int) -> int | None:
+    """Return the exit status of a run that this studio started and that ended; None otherwise."""
+    return next((child.poll() for child in _children if child.pid == process), None)
+
+
+def pause(process: int) -> None:
+    """Stop a run and its workers where they are."""
+    _send(process, signal.SIGSTOP)
+
+
+def resume(process: int) -> None:
+    """Let a paused run go on."""
+    _send(process, signal.SIGCONT)
+
+
+def stop(process: int) -> None:
+    """End a run as Ctrl-C does: what is finished stays, and the same command goes on from there."""
+    _send(process, signal.SIGCONT)
+    with contextlib.suppress(OSError):
+        os.kill(process, signal.SIGINT)
+
+
+def _send(process: int, what: signal.Signals) -> None:
+    """Send a signal to a process and to its group where it leads one."""
+    with contextlib.suppress(OSError):
+        if os.getpgid(process) == process:
+            os.killpg(process, what)
+        else:
+            os.kill(process, what)
+
+
+def tail(path: Path) -> str:
+    """Return the end of a text file; "" where there is none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - LARGEST_BYTES))
+            return file.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def log_lines(out: Path) -> list[str]:
+    """Return the last lines of the log of a run."""
+    return tail(out / LOG).splitlines()[-SHOWN_LINES:]
+
+
+def logged_warnings(out: Path) -> list[str]:
+    """Return the warnings in the log of a run, each once."""
+    found = re.findall(r"^\d\d:\d\d:\d\d WARNING (.*)$", tail(out / LOG), re.MULTILINE)
+    return list(dict.fromkeys(found))
+
+
+def stages(out: Path) -> list[dict[str, Any]]:
+    """Return the steps of a run in order: name, finished fraction, and the time left as far as it is known."""
+    steps: dict[str, dict[str, float]] = {}
+    for line in tail(out / PROGRESS).splitlines():
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            item = json.loads(line)
+            step = steps.setdefault(item["step"], {"began": item["at"], "first": item["fraction"]})
+            step |= {"at": item["at"], "fraction": item["fraction"]}
+    shown = []
+    for name, step in steps.items():
+        left, seconds, part = "", None, step["fraction"] - step["first"]
+        if part >= LEAST_FRACTION and step["fraction"] < 1:
+            speed = part / max(step["at"] - step["began"], 1e-3)
+            seconds = (1 - step["fraction"]) / speed
+            left = f"about {duration(seconds)} left"
+        shown.append({"name": name, "percent": round(100 * step["fraction"], 1), "left": left, "seconds": seconds})
+    return shown
+
+
+def time_left(out: Path) -> str:
+    """Return the time left of a whole run, report included, as soon as its pairs tell; "" before."""
+    for stage in stages(out):
+        if stage["name"] in PAIR_STEPS and stage["seconds"] is not None:
+            return f"about {duration(stage['seconds'] + REPORT_S)} left, report included"
+    return ""
+
+
+def finished_warnings(out: Path) -> list[dict[str, Any]]:
+    """Return the warnings of a finished run: code, what it is about, and the sentence with the remedy."""
+    try:
+        summary = read_object(read_text(Folder(out).summary))
+    except (OSError, RecordError):
+        return []
+    records = summary.get("warning_records") or []
+    sentences = [str(text) for text in summary.get("warnings") or []]
+    found = []
+    for number, sentence in enumerate(sentences):
+        record = records[number] if number < len(records) and isinstance(records[number], dict) else {}
+        found.append({"code": str(record.get("code", "")), "subject": str(record.get("subject", "")), "text": sentence})
+    return found

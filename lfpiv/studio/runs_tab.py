@@ -1,0 +1,179 @@
+"""Tab of runs: start, pause, resume and stop `lfpiv run`; its stages, time left, warnings and log."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import trame_client.widgets.html as html
+from trame.widgets import vuetify3 as v3
+
+from lfpiv.errors import InputError
+from lfpiv.results.folder import Folder
+from lfpiv.studio import controls, run_process
+from lfpiv.studio.session import Session
+
+LOOK_EVERY_S = 0.5
+"""Time between two looks at a run [s]."""
+
+
+def build(session: Session) -> None:
+    """Build the tab."""
+    Runs(session)
+
+
+class Runs:
+    """State and page of the tab."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.state = session, session.state
+        self.process: int | None = None
+        self.state.update(
+            {
+                "p_out": "results", "p_pairs": "", "p_volumes": False, "p_workers": "", "p_status": "none",
+                "p_stages": [], "p_log": "", "p_warnings": [], "p_end": "", "p_stop_with_studio": False, "p_since": "",
+                "p_report": False, "p_left": "",
+            }
+        )  # fmt: skip
+        session.listeners.append(self._changed)
+        session.server.controller.on_server_ready.add(lambda **_: session.start(self._watch()))
+        session.closers.append(self._close)
+        self._page()
+
+    @property
+    def out(self) -> Path:
+        """Folder of results that is asked for, within the given folders."""
+        base = self.session.experiment.parent if self.session.experiment else self.session.places.roots[0]
+        return self.session.places.within(base / str(self.state.p_out or "results"))
+
+    def _changed(self, what: str) -> None:
+        """Offer the folder of the open results."""
+        results, experiment = self.session.results, self.session.experiment
+        if what == "results" and results is not None and results.is_dir():
+            inside = experiment is not None and experiment.parent in results.parents
+            self.state.p_out = str(results.relative_to(experiment.parent)) if inside else str(results)  # type: ignore[union-attr]
+
+    def start(self) -> None:
+        """Start the run that is asked for; a finished part in the folder is not repeated."""
+        session, s = self.session, self.state
+        if session.experiment is None:
+            raise InputError(
+                "experiment: expected an experiment file to run, found none. Open it in the tab Experiment."
+            )
+        if session.draft is not None and session.draft.changed:
+            raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
+        options = [*(["--pairs", str(s.p_pairs)] if s.p_pairs else []), *(["--keep-volumes"] if s.p_volumes else [])]
+        if s.p_workers:
+            options += ["--workers", str(s.p_workers)]
+        if any(option.startswith("-") for option in (str(s.p_pairs), str(s.p_workers))):
+            raise InputError("pairs, workers: expected numbers, found an option.")
+        self.process = run_process.start(session.experiment, self.out, options)
+        s.p_end, s.p_warnings = "", []
+        self._look()
+
+    def control(self, what: str) -> None:
+        """Pause, resume or stop the run."""
+        if self.process is not None:
+            getattr(run_process, what)(self.process)
+        self._look()
+
+    async def _watch(self) -> None:
+        """Look at the run of the folder again and again."""
+        while True:
+            await asyncio.sleep(LOOK_EVERY_S)
+            with self.state:
+                self.session.guarded(self._look)()
+
+    def _look(self) -> None:
+        """Show what the run of the folder does, whoever started it."""
+        s = self.state
+        try:
+            out = self.out
+        except InputError:
+            return
+        found = run_process.holder(out)
+        if found is not None and self.process != found.process:
+            self.process, s.p_since = found.process, found.since
+        now = "none" if self.process is None else run_process.status(self.process)
+        if now in ("running", "paused") or s.p_status in ("running", "paused"):
+            s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
+            s.p_log = "\n".join(run_process.log_lines(out))
+            s.p_warnings = [{"code": "", "subject": "", "text": text} for text in run_process.logged_warnings(out)]
+        if s.p_status in ("running", "paused") and now == "ended":
+            self._ended(out)
+        s.p_status = now
+        s.p_report = Folder(out).report.is_file()
+
+    def _ended(self, out: Path) -> None:
+        """Show warnings of the finished run, and its results in the other tabs."""
+        number = run_process.exit_status(self.process or 0)
+        self.process = None
+        self.state.p_end = {0: "finished", 3: "finished; some pairs failed", None: "ended"}.get(
+            number, "ended early; see its log"
+        )
+        if number in (0, 3, None) and (finished := run_process.finished_warnings(out)):
+            self.state.p_warnings = finished
+        if any((out / "vectors").glob("*.nc")):
+            self.session.results = out
+            self.session.changed("results")
+
+    def show(self, subject: str) -> None:
+        """Show the camera that a warning is about."""
+        names = [name for name in self.state.i_cameras if name in subject]
+        if names:
+            self.state.i_camera = names[0]
+        self.state.tab = "images"
+
+    def _close(self) -> None:
+        """End the run with the studio if that is asked for; otherwise leave it."""
+        if self.process is not None and self.state.p_stop_with_studio:
+            run_process.stop(self.process)
+
+    # -- page ---------------------------------------------------------------------------------------------------------
+
+    def _page(self) -> None:
+        control = self.session.guarded(self.control)
+        running = "['running', 'paused'].includes(p_status)"
+        with html.Div(classes="lf-form"):
+            with html.Div(classes="lf-bar"):
+                for name, label, hint in (
+                    ("p_out", "folder of results", "results"), ("p_pairs", "pairs A:B", "all"),
+                    ("p_workers", "workers", "1"),
+                ):  # fmt: skip
+                    v3.VTextField(
+                        v_model=(name,), label=label, placeholder=hint, density="compact", hide_details=True,
+                        variant="outlined", id=name.replace("_", "-"), disabled=(running,), persistent_placeholder=True,
+                    )  # fmt: skip
+                controls.switch("p_volumes", "keep volumes")
+                controls.switch("p_stop_with_studio", "stop the run when the studio ends")
+            with html.Div(classes="lf-bar"):
+                start = self.session.guarded(self.start)
+                controls.button("Start", start, "mdi-play", id="p-start", disabled=(running,), color="primary")
+                controls.button(
+                    "Pause", (control, "['pause']"), "mdi-pause", id="p-pause", v_if="p_status === 'running'"
+                )
+                controls.button(
+                    "Resume", (control, "['resume']"), "mdi-play", id="p-resume", v_if="p_status === 'paused'"
+                )
+                controls.button("Stop", (control, "['stop']"), "mdi-stop", id="p-stop", v_if=running, color="error")
+                html.Span(
+                    "{{ p_status === 'none' ? '' : p_status }} {{ p_end }} {{ p_status === 'running' ? p_left : '' }}",
+                    id="p-status",
+                    role="status",
+                )
+            html.Div(
+                "The run goes on without this page and without the studio; `lfpiv run` with the same file and folder "
+                "continues it.", v_if=running, classes="lf-note",
+            )  # fmt: skip
+            with html.Div(v_for="stage in p_stages", key="stage.name", classes="lf-stage"):
+                html.Span("{{ stage.name }}")
+                v3.VProgressLinear(model_value=("stage.percent",), height=8, rounded=True, color="primary")
+                html.Span("{{ stage.percent }} % {{ stage.left }}", classes="lf-note")
+            with html.Div(v_for="(warning, number) in p_warnings", key="number", classes="lf-card"):
+                html.B("{{ warning.subject || 'warning' }}")
+                html.Div("{{ warning.text }}")
+                html.Div("code: {{ warning.code }}", v_if="warning.code", classes="lf-note")
+                controls.button("Show the images", (self.show, "[warning.subject || warning.text]"))
+            with html.Details(v_if="p_log", open=True):
+                html.Summary("log")
+                html.Pre("{{ p_log }}", classes="lf-diff", id="p-log")
