@@ -12,7 +12,7 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
-from lfpiv.studio import form_tab, images_tab, results_tab, runs_tab, space_tab
+from lfpiv.studio import form_tab, images_tab, preview_tab, results_tab, runs_tab, space_tab
 from lfpiv.studio.access import Places
 from lfpiv.studio.session import Session
 
@@ -20,6 +20,7 @@ TABS = {
     "images": ("Rig and images", images_tab),
     "experiment": ("Experiment", form_tab),
     "space": ("Space", space_tab),
+    "preview": ("Preview", preview_tab),
     "runs": ("Runs", runs_tab),
     "results": ("Results", results_tab),
 }

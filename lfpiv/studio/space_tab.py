@@ -49,7 +49,7 @@ class Space:
         if what == "experiment":
             self.placed = False
             self.shapes.clear()
-        if what in ("experiment", "typed") and not self.dragged:
+        if what in ("experiment", "typed") and not self.dragged and self.state.tab == "space":
             self.draw()
 
     def _shape(self, camera: dict[str, Any]) -> tuple[int, int]:

@@ -1,0 +1,266 @@
+"""Tab of preview and tuning: one pair on coarse voxels with other settings, before and after side by side; the cost."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+import tomlkit
+import trame_client.widgets.html as html
+from trame.widgets import vtk as vtk_widgets
+
+import lfpiv
+from lfpiv.errors import InputError
+from lfpiv.quantities import duration
+from lfpiv.studio import controls, layers, look
+from lfpiv.studio.session import Session
+
+FEW_VOXELS = 60_000
+"""Voxels of a trial that is done within seconds."""
+
+AUTOMATIC = ("smart.sieve_voxel", "smart.intensity_cap", "correlation.max_displacement_voxel")
+"""Settings that have a value of their own unless a box is ticked."""
+
+SLIDERS = (
+    ("correlation.overlap", "overlap of windows", 0.0, 0.9, 0.05, 0.5),
+    ("correlation.max_displacement_voxel", "largest displacement [voxel]", 1.0, 32.0, 0.5, 8.0),
+    ("correlation.smoothing_voxel", "smoothing of volumes [voxel]", 0.0, 3.0, 0.1, 0.5),
+    ("correlation.intensity_power", "power of intensities", 0.1, 1.0, 0.05, 0.5),
+    ("smart.iterations", "iterations", 1, 40, 1, 14),
+    ("smart.sieve_voxel", "sieve [voxel]", 0.0, 2.0, 0.05, 0.5),
+    ("smart.intensity_cap", "cap of intensities [counts]", 0.0, 5000.0, 10.0, 0.0),
+    ("smart.relaxation", "relaxation", 0.2, 2.5, 0.1, 1.0),
+)
+"""Key, label, range, step and first value of each slider."""
+
+
+def build(session: Session) -> None:
+    """Build the tab."""
+    Preview(session)
+
+
+def state_of(key: str) -> str:
+    """Return the name in the state of a slider's value."""
+    return "t_" + key.replace(".", "_")
+
+
+class Preview:
+    """State, pictures and panel of the tab."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.state = session, session.state
+        self.grids: list[pv.ImageData | None] = [None, None]
+        self.pictures = (look.Picture.empty((600, 600)), look.Picture.empty((600, 600)))
+        self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
+        values = {state_of(key): first for key, _, _, _, _, first in SLIDERS}
+        values |= {f"{state_of(key)}_auto": True for key in AUTOMATIC}
+        self.state.update(
+            {"t_pair": 0, "t_coarser": 1.0, "t_windows": "", "t_busy": "", "t_before": "", "t_after": "", "t_plan": [],
+             "t_plane": 0.5, "t_colour": "speed", "t_voxels": ""} | values
+        )  # fmt: skip
+        self.state.change("t_plane", "t_colour", "theme")(lambda **_: session.guarded(self.draw)())
+        self.state.change("t_coarser")(lambda **_: self._tell_voxels())
+        session.listeners.append(self._changed)
+        self._panel()
+
+    def _changed(self, what: str) -> None:
+        """Take the values of the file."""
+        draft, s = self.session.draft, self.state
+        if what not in ("experiment", "saved") or draft is None:
+            return
+        for key, *_ in SLIDERS:
+            value = draft.get(key.split("."))
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                s[state_of(key)] = value
+                if key in AUTOMATIC:
+                    s[f"{state_of(key)}_auto"] = False
+        windows = draft.get(("correlation", "windows"))
+        s.t_windows = tomlkit.item(windows).as_string() if windows is not None else ""
+        if what == "experiment":
+            s.t_coarser = round(max(1.0, (self._voxels() / FEW_VOXELS) ** (1 / 3)), 1)
+        self._tell_voxels()
+
+    def _voxels(self) -> float:
+        """Return the number of voxels that the file states; 1 where it cannot be told."""
+        draft = self.session.draft
+        try:
+            assert draft is not None
+            size, edge = (draft.get(("volume", key)) for key in ("size_mm", "voxel_mm"))
+            return float(np.prod(np.asarray(size, float) / float(edge)))
+        except (AssertionError, TypeError, ValueError, ZeroDivisionError):
+            return 1.0
+
+    def _tell_voxels(self) -> None:
+        self.state.t_voxels = f"{self._voxels() / float(self.state.t_coarser) ** 3:,.0f} voxels"
+
+    def changed(self) -> dict[str, dict[str, Any]]:
+        """Return the settings that the sliders state, by table."""
+        found: dict[str, dict[str, Any]] = {"smart": {}, "correlation": {}}
+        for key, _, _, _, step, _ in SLIDERS:
+            table, name = key.split(".")
+            if key in AUTOMATIC and self.state[f"{state_of(key)}_auto"]:
+                continue
+            value = self.state[state_of(key)]
+            found[table][name] = int(value) if isinstance(step, int) else float(value)
+        if str(self.state.t_windows).strip():
+            try:
+                windows = tomlkit.parse(f"windows = {self.state.t_windows}").unwrap()["windows"]
+            except Exception:
+                raise InputError("windows: expected a list such as [32, 16, 12], found other text.") from None
+            found["correlation"]["windows"] = tuple(tuple(one) if isinstance(one, list) else one for one in windows)
+        return found
+
+    def try_it(self) -> None:
+        """Measure the pair with the settings of the sliders."""
+        if self.session.experiment is None:
+            raise InputError("experiment: expected an experiment file, found none. Open it in the tab Experiment.")
+        if self.state.t_busy:
+            return
+        changed = self.changed()
+        self.session.start(self._try(changed))
+
+    async def _try(self, changed: dict[str, Any]) -> None:
+        session = self.session
+        with self.state:
+            self.state.t_busy = "measuring the pair"
+        try:
+            with tempfile.TemporaryDirectory(prefix="lfpiv-") as folder:
+                request = {
+                    "experiment": str(session.experiment), "results": str(session.results or ""), "changed": changed,
+                    "pair": int(self.state.t_pair), "coarser": float(self.state.t_coarser), "out": folder,
+                }  # fmt: skip
+                answer = await _ask([sys.executable, "-m", "lfpiv.studio.trial"], json.dumps(request))
+                if "error" in answer:
+                    raise InputError(answer["error"])
+                grid = layers.grid_of(
+                    lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze()
+                )
+        finally:
+            with self.state:
+                self.state.t_busy = ""
+        with self.state:
+            self.grids = [self.grids[1] if self.grids[1] is not None else grid, grid]
+            uncertain = f", uncertainty {answer['uncertainty']} voxel" if answer["uncertainty"] is not None else ""
+            text = f"{answer['valid']} % of {answer['vectors']:,} vectors valid{uncertain}, {answer['seconds']} s"
+            text += "" if answer["calibrated"] else "; nominal cameras, not calibrated yet"
+            self.state.t_before, self.state.t_after = self.state.t_after or text, text
+            self.draw()
+
+    def draw(self) -> None:
+        """Draw a plane of before and after with the same colours."""
+        after = self.grids[1]
+        if after is None:
+            return
+        limits = look.own_limits(after, self.state.t_colour)
+        for grid, picture, view in zip(self.grids, self.pictures, self.views, strict=True):
+            if grid is None:
+                continue
+            low, high = grid.bounds[4:]
+            at = low + float(self.state.t_plane) * (high - low)
+            shown = look.Look(
+                colour=self.state.t_colour, limits=limits, slices=(None, None, at), theme=self.state.theme,
+                arrows=max(1, round(max(grid.dimensions) / 14)), hide_replaced=False, replaced=True,
+            )  # fmt: skip
+            picture.show(grid, shown, {}, self.state.t_colour)
+            view.update()
+
+    def keep(self) -> None:
+        """Write the settings of the sliders into the form."""
+        draft = self.session.draft
+        if draft is None:
+            return
+        for table, settings in self.changed().items():
+            for name, value in settings.items():
+                draft.set((table, name), list(value) if isinstance(value, tuple) else value)
+        self.session.told("draft")
+        self.state.tab = "experiment"
+
+    def plan(self) -> None:
+        """Ask what the campaign will take."""
+        if self.session.experiment is not None and not self.state.t_busy:
+            self.session.start(self._plan())
+
+    async def _plan(self) -> None:
+        command = [sys.executable, "-m", "lfpiv", "plan", str(self.session.experiment), "--json", "--quiet"]
+        if self.session.results is not None and self.session.results.is_dir():
+            command += ["--out", str(self.session.results)]
+        with self.state:
+            self.state.t_busy = "doing the first pair, whose times are scaled"
+        try:
+            answer = await _ask(command, "")
+        finally:
+            with self.state:
+                self.state.t_busy = ""
+        with self.state:
+            times, memory = answer["time"], answer["memory_bytes"]
+            durations = {name: value for name, value in times.items() if isinstance(value, int | float)}
+            needs = {name: value for name, value in memory.items() if value}
+            self.state.t_plan = [
+                *(f"{name.replace('_', ' ')}: {duration(value)}" for name, value in durations.items()),
+                *(f"memory, {name.replace('_', ' ')}: {value / 2**20:,.0f} MiB" for name, value in needs.items()),
+                *answer["limits"],
+            ]
+
+    # -- page ---------------------------------------------------------------------------------------------------------
+
+    def _panel(self) -> None:
+        guarded = self.session.guarded
+        with html.Div(classes="lf-split"):
+            with html.Div(classes="lf-panel"):
+                html.Div("{{ t_busy }} ...", v_if="t_busy", classes="lf-note", role="status", id="t-busy")
+                with html.Div(classes="lf-buttons"):
+                    controls.button("Try", guarded(self.try_it), "mdi-play", id="t-try", disabled=("!!t_busy",))
+                    controls.button("Write into the form", guarded(self.keep), id="t-keep")
+                    controls.button("Cost of the campaign", guarded(self.plan), disabled=("!!t_busy",))
+                html.Div("{{ line }}", v_for="line in t_plan", key="line", classes="lf-note")
+                controls.slider("t_pair", "pair", 0, 20, 1)
+                controls.slider("t_coarser", "voxels longer by", 1.0, 4.0, 0.1)
+                html.Div("{{ t_voxels }}", classes="lf-note")
+                html.H3("Correlation and SMART")
+                with html.Div(classes="lf-slider"):
+                    html.Label("windows of the passes [voxel]", for_="t-windows")
+                    html.Input(
+                        v_model=("t_windows",), placeholder="[32, 16, 12, 12]", id="t-windows", classes="lf-typed"
+                    )
+                for key, label, low, high, step, _ in SLIDERS:
+                    name = state_of(key)
+                    if key in AUTOMATIC:
+                        controls.switch(f"{name}_auto", f"{label.partition(' [')[0]}: automatic")
+                        controls.slider(name, label, low, high, step, v_if=f"!{name}_auto")
+                    else:
+                        controls.slider(name, label, low, high, step)
+                html.H3("Shown")
+                controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01)
+                controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
+            with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
+                self.views = tuple(self._view(number, name) for number, name in enumerate(("before", "after")))
+
+    def _view(self, number: int, name: str) -> Any:
+        with html.Div(classes="lf-view"):
+            html.Div(f"{name}: {{{{ t_{name} || 'nothing yet' }}}}", classes="lf-name", id=f"t-{name}")
+            return vtk_widgets.VtkRemoteView(
+                self.pictures[number].plotter.render_window, ref=f"preview_{number}", interactive_ratio=0.7,
+                interactive_quality=70, interactor_events=("t_events", ["EndAnimation"]), EndAnimation=self._linked,
+            )  # fmt: skip
+
+    def _linked(self, *_: Any, **__: Any) -> None:
+        for view in self.views:
+            view.update()
+
+
+async def _ask(command: list[str], text: str) -> dict[str, Any]:
+    """Run a command that answers with JSON on its standard output."""
+    pipe = asyncio.subprocess.PIPE
+    process = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
+    out, problem = await process.communicate(text.encode())
+    start = out.find(b"{")
+    if process.returncode or start < 0:
+        lines = problem.decode(errors="replace").strip().splitlines()
+        raise InputError(lines[-1] if lines else f"{command[3]}: ended without an answer.")
+    return dict(json.loads(out[start:]))
