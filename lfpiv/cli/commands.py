@@ -312,6 +312,27 @@ def _export(
     _output.show({"files": [str(path) for path in written], "left_out": left_out}, lambda: terminal.say(text))
 
 
+@_command("schema", "lfpiv schema", "lfpiv schema --out schemas")
+def _schema(out: Out = Path(".")) -> None:
+    """Write the JSON Schema of experiment and scene files, by which editors complete and check them.
+
+    DIR/lfpiv-experiment.schema.json and DIR/lfpiv-scene.schema.json; a first line `#:schema PATH` in a file names it.
+    """
+    from lfpiv.files import write_json
+    from lfpiv.settings.experiment import ExperimentTable
+    from lfpiv.settings.keys import json_schema
+    from lfpiv.simulation.scene import Scene
+
+    written = []
+    for name, model in (("experiment", ExperimentTable), ("scene", Scene)):
+        written.append(out / f"lfpiv-{name}.schema.json")
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(json_schema(model), written[-1])
+    _output.show(
+        {"files": [str(path) for path in written]}, lambda: terminal.say(f"schema: {written[0]}, {written[1]}")
+    )
+
+
 @_command("studio", "lfpiv studio experiment.toml", "lfpiv studio results", "lfpiv studio --no-browser --port 8100")
 def _studio(
     path: Annotated[

@@ -14,29 +14,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 import lfpiv
+from lfpiv.calibration.camera import Calibration
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
+from lfpiv.runs import guard
+from lfpiv.runs.frame_light import pair_light, read_darks
+from lfpiv.runs.pair_vectors import measure_vectors
+from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.settings.processing import Correlation, Smart
 
 
 def with_settings(experiment: Experiment, coarser: float, changed: dict[str, dict[str, Any]]) -> Experiment:
     """Return an experiment on voxels that are some times as long, with some settings of SMART and correlation changed.
 
-    The volume has no guard layers, and its voxels are those that are reconstructed, so that a trial takes seconds.
+    Particles are smaller than coarse voxels. So their size and the cap, where these are to be measured, are left out.
     """
     grid = experiment.grid
     edge = grid.voxel_mm * coarser
-    size = [max(n * grid.voxel_mm, 4 * edge) for n in grid.shape[::-1]]
-    coarse = Grid.from_extent(centre_mm=tuple(grid.centre_mm.tolist()), size_mm=tuple(size), voxel_mm=edge)
-    smart = Smart.model_validate(experiment.smart.model_dump() | {"refinement": 1.0} | changed.get("smart", {}))
+    x, y, z = (max(n * grid.voxel_mm, 4 * edge) for n in grid.shape[::-1])
+    cx, cy, cz = grid.centre_mm.tolist()
+    coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(x, y, z), voxel_mm=edge)
+    stated = experiment.smart.model_dump() | changed.get("smart", {})
+    measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if stated[key] == "auto"}
+    smart = Smart.model_validate(stated | measured | {"refinement": 1.0, "estimate": "correlation"})
     correlation = Correlation.model_validate(experiment.correlation.model_dump() | changed.get("correlation", {}))
-    return replace(experiment, grid=coarse, guard_mm=0.0, smart=smart, correlation=correlation, background="none")
+    return replace(experiment, grid=coarse, smart=smart, correlation=correlation)
+
+
+def vectors_of(experiment: Experiment, calibration: Calibration, pair: int) -> xr.Dataset:
+    """Reconstruct both frames of a pair and correlate them, without the checks and measurements of a run."""
+    layers = guard.layers(experiment, None)
+    square = all(camera.lattice.layout == "square" for camera in calibration.cameras.values())
+    form = "profiles" if square else "pixels"  # which is built fastest
+    weights = lfpiv.build_weights(calibration, guard.with_guard(experiment, layers).grid, form=form)
+    darks = read_darks(experiment)
+    light = pair_light(
+        experiment, calibration.cameras, darks, pair, lambda name, at: experiment.particle_image(name, *at)
+    )
+    work = Reconstructor(experiment=experiment, weights=weights, guard=layers, refinement=1.0)
+    images, noise, frames = ([getattr(one, name) for one in light] for name in ("images", "noise", "frame"))
+    return measure_vectors(*work.volumes(images, noise, frames), experiment)
 
 
 def measure(request: dict[str, Any]) -> dict[str, Any]:
@@ -46,9 +70,8 @@ def measure(request: dict[str, Any]) -> dict[str, Any]:
     calibrated = stored is not None and stored.is_file()
     calibration = lfpiv.load_calibration(stored) if calibrated else lfpiv.thin_lens(experiment)  # type: ignore[arg-type]
     start = time.perf_counter()
-    rig = lfpiv.prepare(experiment, calibration)
     pair = int(request["pair"])
-    vectors = lfpiv.measure_pair(rig, pair)
+    vectors = vectors_of(experiment, calibration, pair)
     netcdf.write_vectors(vectors, Folder(Path(request["out"])).vectors(pair), attributes={"pair": pair})
     uncertainty = float(np.nanmedian(vectors["uncertainty"].values)) if "uncertainty" in vectors else float("nan")
     return {

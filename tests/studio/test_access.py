@@ -1,0 +1,91 @@
+"""Trust: the studio opens nothing outside its folders, and runs are started once and stopped as by Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from lfpiv.cli import commands
+from lfpiv.errors import InputError
+
+
+def test_places_outside_the_folders_are_refused(tmp_path):
+    from lfpiv.studio.access import Places
+
+    inside, outside = tmp_path / "inside", tmp_path / "outside"
+    for folder in (inside, outside):
+        folder.mkdir()
+    (inside / "link").symlink_to(outside)
+    places = Places((inside.resolve(),))
+    assert places.within("a/b") == inside.resolve() / "a" / "b"
+    for wrong in ("..", str(outside), "link/results", "/etc/passwd", "a/../../outside"):
+        with pytest.raises(InputError, match="expected a place in"):
+            places.within(wrong)
+
+
+def test_a_held_folder_gets_no_second_run(tmp_path):
+    from lfpiv.results.folder import Folder
+    from lfpiv.studio import run_process
+
+    with Folder(tmp_path).held():
+        assert run_process.holder(tmp_path).process == os.getpid()
+        with pytest.raises(InputError, match=f"process {os.getpid()}"):
+            run_process.start(tmp_path / "experiment.toml", tmp_path, [])
+    assert run_process.holder(tmp_path) is None
+
+
+def test_a_run_is_paused_resumed_and_stopped():
+    from lfpiv.studio import run_process
+
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    run_process.pause(process.pid)
+    until_status(process.pid, "paused")
+    run_process.resume(process.pid)
+    until_status(process.pid, "running")
+    run_process.stop(process.pid)
+    assert process.wait(20) == -signal.SIGINT or process.returncode == 1
+    assert run_process.status(process.pid) == "ended"
+
+
+def until_status(process, wanted):
+    from lfpiv.studio import run_process
+
+    end = time.monotonic() + 20
+    while run_process.status(process) != wanted:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_stages_tell_the_time_left(tmp_path):
+    from lfpiv.studio import run_process
+
+    lines = ['{"step": "weights", "fraction": 1.0, "at": 5.0}', '{"step": "image pairs", "fraction": 0.0, "at": 10.0}']
+    lines += ['{"step": "image pairs", "fraction": 0.25, "at": 40.0}', '{"torn']
+    (tmp_path / ".run.jsonl").write_text("\n".join(lines), "utf-8")
+    weights, pairs = run_process.stages(tmp_path)
+    assert weights["percent"] == 100 and pairs["percent"] == 25 and pairs["left"] == "about 2 min left"
+    assert run_process.time_left(tmp_path) == "about 2 min left, report included"
+
+
+def test_progress_is_recorded_where_the_environment_asks(tmp_path, monkeypatch, tiny_experiment):
+    from lfpiv.studio import run_process
+
+    monkeypatch.setenv("LFPIV_PROGRESS_FILE", str(tmp_path / ".run.jsonl"))
+    with commands.terminal.Output().progress() as progress:
+        progress("calibration", 0.5)
+        progress("calibration", 1.0)
+    assert [stage["percent"] for stage in run_process.stages(tmp_path)] == [100]
+
+
+def test_without_the_extra_one_message_names_it(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert commands.call(["studio", str(tmp_path), "--no-browser"]) == 2
+    assert "pip install 'lfpiv[studio]'" in capsys.readouterr().err
+
+
+def test_nothing_there_is_told(capsys, tmp_path):
+    assert commands.call(["studio", str(tmp_path / "nothing"), "--no-browser"]) == 2
+    assert "found nothing there" in capsys.readouterr().err

@@ -1,0 +1,143 @@
+"""The experiment on the page: the file as a form, its images with what is seen in them, and the rig in space."""
+
+import json
+
+import numpy as np
+import pytest
+
+import lfpiv
+from lfpiv.cli import commands
+from lfpiv.errors import InputError
+
+ON_THE_LENS_PX = 0.5
+"""Largest distance of a lattice's circle from the middle of its microimage [pixel]."""
+DOT_PX = 3.0
+"""Largest distance of a dot's mark from the dot's light [pixel]: a sixth of a microimage."""
+
+
+@pytest.fixture
+def draft(tiny_experiment):
+    from lfpiv.studio.draft import Draft
+
+    text = tiny_experiment.read_text("utf-8").replace("f_number = 4.0", "f_number = 4.0  # as set on its ring", 1)
+    tiny_experiment.write_text(f"# the rig of May\n{text}", "utf-8")
+    return Draft(tiny_experiment)
+
+
+def test_values_change_and_comments_stay(draft):
+    before = draft.text.splitlines()
+    draft.write(("camera", 0, "f_number"), "5.6", plain=False)
+    draft.write(("volume", "size_mm"), "[0.8, 0.6, 0.5]", plain=False)
+    draft.write(("smart", "iterations"), "9", plain=False)
+    assert draft.problems() == {}
+    draft.save()
+    after = draft.path.read_text("utf-8").splitlines()
+    assert "f_number = 5.6  # as set on its ring" in after and after[0] == "# the rig of May"
+    changed = {line for line in before if line not in after}
+    assert changed == {"f_number = 4.0  # as set on its ring", "size_mm = [0.8, 0.6, 0.4]"}
+    assert lfpiv.open_experiment(draft.path).smart.iterations == 9
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "found"),
+    [
+        ("camera.0.f_number", "-4", "expected a number above 0, found -4."),
+        ("camera.1.focal_length_mm", "", "this key is missing. Add it."),
+        ("volume.voxel_mm", "fine", "expected a number, found the text 'fine'."),
+        ("correlation.overlap", "1.5", "expected a number below 1, found 1.5."),
+    ],
+)
+def test_a_mistake_is_told_at_its_place_and_not_saved(draft, name, text, found):
+    from lfpiv.studio.draft import location_of
+
+    draft.write(location_of(name), text, plain=False)
+    assert found in draft.problems()[name]
+    with pytest.raises(InputError, match="not saved"):
+        draft.save()
+
+
+def test_a_file_that_another_program_changed_is_kept(draft):
+    draft.write(("name",), "other", plain=True)
+    draft.path.write_text(draft.read + "# by an editor\n", "utf-8")
+    with pytest.raises(InputError, match="another program"):
+        draft.save()
+
+
+def test_every_key_of_the_file_has_a_field_with_its_meaning(draft):
+    rows = [row for table in draft.tables() for row in table["rows"]]
+    assert {"name", "camera.1.f_number", "board.planes_mm", "tracking.rounds", "compute.threads"} <= {
+        r["id"] for r in rows
+    }
+    assert all(row["meaning"] for row in rows) and draft.texts()["camera.1.name"] == "right"
+    (voxel,) = [row for row in rows if row["id"] == "volume.voxel_mm"]
+    assert voxel["unit"] == "mm" and voxel["default"] == "required"
+
+
+def test_cameras_and_solids_are_added_and_removed(draft):
+    draft.add_camera()
+    draft.add_solid("half_space", {"point_mm": [0.0, -0.2, 0.0], "normal": [0.0, 1.0, 0.0]})
+    assert draft.problems() == {} and draft.get(("camera", 2, "focal_length_mm")) == 100.0
+    draft.remove(("camera", 2))
+    draft.remove(("volume", "solid", 0))
+    assert len(draft.values["camera"]) == 2 and draft.problems() == {}
+
+
+def test_the_schema_names_every_key(tmp_path, capsys):
+    assert commands.call(["schema", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "lfpiv-experiment.schema.json").read_text("utf-8"))
+    table = found["$defs"]["CameraTable"]["properties"]
+    assert table["f_number"]["description"] and table["f_number"]["maximum"] == 1e4
+    assert json.loads((tmp_path / "lfpiv-scene.schema.json").read_text("utf-8"))["properties"]["flow"]
+
+
+def test_circles_lie_on_microimages_and_marks_on_dots(small_run):
+    from lfpiv.studio.raw_images import RawImages
+
+    experiment = lfpiv.open_experiment(small_run.experiment)
+    images = RawImages(experiment, small_run.out)
+    white = images.recorded("left", images.read("left", "white"))
+    centres = images.lattice_px("left")
+    inner = centres[((centres > 20) & (centres < 380)).all(1)][::7]
+    window = np.mgrid[-6:7, -6:7]
+    for column, row in inner:
+        at = np.rint((row, column)).astype(int)
+        light = white[at[0] - 6 : at[0] + 7, at[1] - 6 : at[1] + 7]
+        middle = at + (window * (light - light.min())).sum((1, 2)) / (light - light.min()).sum()
+        assert np.hypot(*(middle - (row, column))) < ON_THE_LENS_PX
+    places, names, arrows = images.dots("left", 1)
+    assert len(places) == len(names) and len(arrows)
+    predicted = np.array([place for place in places if (place > 15).all() and (place < 385).all()])
+    board = images.recorded("left", images.read("left", "plane 1"))
+    lit = [board[int(r) - 9 : int(r) + 10, int(c) - 9 : int(c) + 10].max() for c, r in predicted]
+    assert np.median(lit) > 5 * np.median(board)
+
+
+def test_a_view_through_the_pupil_follows_the_pixel(small_run):
+    from lfpiv.studio.raw_images import RawImages
+
+    images = RawImages(lfpiv.open_experiment(small_run.experiment), small_run.out)
+    centre = min(images.lattice_px("left"), key=lambda place: np.hypot(*(place - 200)))
+    u, v = images.pupil_at("left", tuple(centre))
+    right = images.pupil_at("left", (centre[0] + 4, centre[1]))
+    radius = images.calibrated("left").optics.pupil_radius_mm
+    assert np.hypot(u, v) < 0.15 * radius and abs(right[0] - u) > 0.2 * radius > 5 * abs(right[1] - v)
+    view = images.pupil_view("left", images.read("left", "white"), (u, v))
+    assert np.median(view[view > 0]) == pytest.approx(1, abs=0.05)  # as bright as the white scene
+    plane = images.refocused("left", "plane 1", 0.0)
+    assert plane.max() > 4 * np.median(plane)
+
+
+def test_cameras_see_what_they_look_at():
+    from lfpiv.studio import space
+
+    camera = {
+        "focal_length_mm": 100.0, "magnification": -1.0, "f_number": 4.0, "microlens_pitch_mm": 0.1,
+        "microlens_focal_length_mm": 0.8, "pixel_um": 5.5, "nominal_angle_deg": 30.0,
+    }  # fmt: skip
+    pupil, corners, _ = space.view_of(camera, (2000, 1000))
+    assert np.allclose(pupil, 200 * np.array([0.5, 0, np.sqrt(0.75)]))
+    assert np.ptp(corners[:, 1]) == pytest.approx(11.0)  # 2000 pixels of 5.5 um at M = -1
+    points = np.array([[0, 0, 0], [0, 5.4, 0], [0, 5.6, 0], [0, 0, 300]], float)
+    assert space.inside(pupil, corners, points).tolist() == [True, True, False, False]
+    opposite = space.view_of(camera | {"nominal_direction": [0, 0, 1]}, (2000, 1000))
+    assert np.allclose(opposite[2], [0, 0, 1])
