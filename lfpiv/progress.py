@@ -7,6 +7,9 @@ from collections.abc import Callable
 Progress = Callable[[str, float], None]
 """Called as ``progress(step, fraction)``, fraction from 0 to 1."""
 
+PROGRESS_FILE = "LFPIV_PROGRESS_FILE"
+"""Variable of the environment that names a file to which progress is appended as lines of JSON. The studio reads it."""
+
 StepProgress = Callable[[float], None]
 """Called as ``progress(fraction)``, fraction from 0 to 1."""
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from lfpiv.errors import InputError, printable
-from lfpiv.progress import Progress
+from lfpiv.progress import PROGRESS_FILE, Progress
 from lfpiv.quantities import duration
 from lfpiv.warn import name_pairs
 
@@ -31,10 +31,8 @@ LOG_EVERY_S = 10.0
 LEAST_FRACTION = 0.02
 """Smallest finished fraction of a step for an estimate of its remaining time."""
 
-PROGRESS_FILE = "LFPIV_PROGRESS_FILE"
-"""Variable of the environment that names a file to which progress is appended as lines of JSON. The studio reads it."""
 RECORD_EVERY_S = 0.2
-"""Shortest time between two such lines of a step [s]."""
+"""Shortest time between two lines of a step in the file that `PROGRESS_FILE` names [s]."""
 
 LISTED_PAIRS = 20
 """Largest number of pairs listed at the end of a run."""

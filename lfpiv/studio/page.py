@@ -27,7 +27,9 @@ TABS = {
 """Name of a tab -> its title, and the module that builds it."""
 
 ENCODED_S = 0.01
-"""Time after which the server looks for an encoded picture again [s]."""
+"""Time after which the server looks for an encoded picture again, longer by as much each time [s]."""
+MOST_LOOKS = 60
+"""Number of looks until the server takes a picture for lost."""
 
 
 def build(given: Path) -> Session:
@@ -64,6 +66,7 @@ def _deliver_soon(protocol: Any) -> None:
     for part in protocol.getLinkProtocols():
         if hasattr(part, "delta_stale_time_before_render"):
             part.delta_stale_time_before_render = ENCODED_S
+            part.stale_count_limit = MOST_LOOKS
 
 
 def routes(session: Session) -> list[web.RouteDef]:

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfpiv.cli.terminal import PROGRESS_FILE
 from lfpiv.errors import InputError
+from lfpiv.progress import PROGRESS_FILE
 from lfpiv.quantities import duration
 from lfpiv.records import RecordError, read_object, read_text
 from lfpiv.results.folder import Folder, make_writable
