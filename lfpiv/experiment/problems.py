@@ -23,9 +23,6 @@ SHOWN_NAME = 60
 MISSING, UNKNOWN = "missing", "extra_forbidden"
 """Types of problems, as pydantic names them."""
 
-_UNITS = {"mm": " mm", "um": " um", "s": " s", "deg": " degrees", "px": " pixels", "gib": " GiB", "voxel": " voxels"}
-"""Units in messages by the end of a key."""
-
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 
 Location = tuple[int | str, ...]
@@ -190,8 +187,10 @@ def _listed(places: Sequence[_Place], most: int, values: Any) -> str:
 
 
 def _wanted(problem: Mapping[str, Any]) -> str:
-    """Return what a value should have been for one form of it."""
-    kind, context, found = problem["type"], problem.get("ctx", {}), problem.get("input")
+    """Return what a value should have been for one form of it. Bounds are in the unit that the key states."""
+    context, found = problem.get("ctx", {}), problem.get("input")
+    bound = next((value for name, value in context.items() if name in ("gt", "ge", "lt", "le")), None)
+    text = f"{bound:g}" if isinstance(bound, float) else str(bound)
     expected: str = {
         "float_type": "a number",
         "int_type": "a whole number",
@@ -202,17 +201,17 @@ def _wanted(problem: Mapping[str, Any]) -> str:
         "model_type": "a table",
         "model_attributes_type": "a table",
         "finite_number": "a finite number",
-        "greater_than": f"a number above {_bound(problem, 'gt')}",
-        "greater_than_equal": f"{_bound(problem, 'ge')} or more",
-        "less_than": f"a number below {_bound(problem, 'lt')}",
-        "less_than_equal": f"{_bound(problem, 'le')} or less",
+        "greater_than": f"a number above {text}",
+        "greater_than_equal": f"{text} or more",
+        "less_than": f"a number below {text}",
+        "less_than_equal": f"{text} or less",
         "literal_error": _one_of(str(context.get("expected"))),
         "too_short": f"at least {context.get('min_length')} value(s)",
         "too_long": f"at most {context.get('max_length')} value(s)",
         "string_too_short": "text that is not empty",
         "string_too_long": f"at most {context.get('max_length')} characters",
         "string_pattern_mismatch": "a name of letters, digits, '_', '-' and '.'",
-    }.get(kind, problem["msg"][:1].lower() + problem["msg"][1:])
+    }.get(problem["type"], problem["msg"][:1].lower() + problem["msg"][1:])
     least = context.get("ge", 0)
     if isinstance(least, float) and least > 0 and isinstance(found, (int, float)) and found <= 0:
         return "a number above 0"
@@ -222,17 +221,6 @@ def _wanted(problem: Mapping[str, Any]) -> str:
 def _one_of(expected: str) -> str:
     """Return the values of a literal, which pydantic lists as ``'a', 'b' or 'c'``."""
     return f"one of {expected.replace(' or ', ', ')}" if " or " in expected else expected
-
-
-def _bound(problem: Mapping[str, Any], name: str) -> str:
-    """Return a bound of a number with its unit, which the key names at its end."""
-    value = problem.get("ctx", {}).get(name)
-    if not isinstance(value, (int, float)):
-        return str(value)
-    keys = [part for part in problem["loc"] if isinstance(part, str) and part.isidentifier()]
-    key = keys[-1] if keys else ""
-    text = str(value) if isinstance(value, int) or value == 0 else f"{value:g}"
-    return text + (_UNITS.get(key.rpartition("_")[2], "") if "_" in key else "")
 
 
 def short(text: str) -> str:

@@ -115,9 +115,9 @@ CHANGES = {
     "huge length": (
         "focal_length_mm = 100.0",
         "focal_length_mm = 1e308",
-        "focal_length_mm: expected 100000 mm or less",
+        "focal_length_mm: expected 100000 or less",
     ),
-    "tiny length": ("spacing_mm = 0.1", "spacing_mm = 1e-300", "spacing_mm: expected 1e-06 mm or more"),
+    "tiny length": ("spacing_mm = 0.1", "spacing_mm = 1e-300", "spacing_mm: expected 1e-06 or more"),
     "tiny magnification": ("magnification = -1.0", "magnification = 1e-300", "magnitude 0.0001 to 1000"),
     "tiny f-number": ("f_number = 4.0", "f_number = 0.1", "f_number: expected microimages from 1 pixel to 4 times"),
     "large f-number": ("f_number = 4.0", "f_number = 10000", "f_number: expected microimages from 1 pixel"),
