@@ -32,7 +32,7 @@ def stored_figures() -> dict[str, Any]:
 
 def draw(name: str, stored: Mapping[str, Any]) -> str:
     """Return one of `PLOTS` as SVG."""
-    figure, (axes,) = svg.new_panel(HEIGHT_INCH)
+    figure, axes = svg.new_panel(HEIGHT_INCH)
     alt = PLOTS[name](axes, stored)
     return svg.to_svg(figure, alt)
 

@@ -118,7 +118,7 @@ def panels(rows: Rows) -> str:
 
 
 def _legend() -> str:
-    figure, (axes,) = svg.new_panel(2.8)
+    figure, axes = svg.new_panel(2.8)
     for label, colour, line in STYLES.values():
         axes.plot([], [], color=colour, ls=line, lw=1.6, label=label)
     axes.axis("off")
@@ -127,7 +127,7 @@ def _legend() -> str:
 
 
 def _panel(case: str, rows: Rows) -> str:
-    figure, (axes,) = svg.new_panel(2.8)
+    figure, axes = svg.new_panel(2.8)
     for row in rows:
         _, colour, line = STYLES[row["method"]]
         part = [100 * value for value in row["curve"]["part"]]

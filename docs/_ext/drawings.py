@@ -199,7 +199,7 @@ DRAWINGS = {
 def draw(name: str) -> str:
     """Return one of `DRAWINGS` as SVG."""
     drawing, height_inch = DRAWINGS[name]
-    figure, (axes,) = svg.new_panel(height_inch)
+    figure, axes = svg.new_panel(height_inch)
     alt = drawing(axes)
     return svg.to_svg(figure, alt)
 

@@ -81,7 +81,7 @@ PLOTS = {"scaling": scaling, "peers": peers}
 
 def draw(name: str) -> str:
     """Return one of `PLOTS` as SVG."""
-    figure, (axes,) = svg.new_panel(2.8)
+    figure, axes = svg.new_panel(2.8)
     alt = PLOTS[name](axes)
     return svg.to_svg(figure, alt)
 

@@ -44,7 +44,7 @@ def panels(stored: Mapping[str, Any]) -> str:
 
 
 def _against_seeding(rows: Sequence[Mapping[str, Any]], key: str, label: str) -> str:
-    figure, (axes,) = svg.new_panel(2.9)
+    figure, axes = svg.new_panel(2.9)
     seedings = sorted({row["ppm"] for row in rows})
     for (way, cameras), (_, colour, line) in STYLES.items():
         known = [row for row in rows if row["way"] == way and row["cameras"] == cameras]
@@ -79,7 +79,7 @@ def _against_seeding(rows: Sequence[Mapping[str, Any]], key: str, label: str) ->
 
 
 def _legend() -> str:
-    figure, (axes,) = svg.new_panel(2.3)
+    figure, axes = svg.new_panel(2.3)
     for name, colour, line in STYLES.values():
         axes.plot(
             [], [], color=colour, ls=line, lw=2.0 if name.startswith("this") else 1.3, marker="o", ms=3, label=name
@@ -90,7 +90,7 @@ def _legend() -> str:
 
 
 def _time(rows: Sequence[Mapping[str, Any]]) -> str:
-    figure, (axes,) = svg.new_panel(2.6)
+    figure, axes = svg.new_panel(2.6)
     names = [way for way, cameras in STYLES if cameras == 2 and way in {row["way"] for row in rows}]
     passes = {row["way"]: row["passes"] for row in rows}
     place = range(len(names))

@@ -31,7 +31,7 @@ def panels(stored: Mapping[str, Any]) -> str:
 
 
 def _panel(rows: Sequence[Mapping[str, Any]], key: str, label: str, logarithmic: bool) -> str:
-    figure, (axes,) = svg.new_panel(2.9)
+    figure, axes = svg.new_panel(2.9)
     for number, (cameras, name) in enumerate(NAMES.items()):
         for condition, line in LINES.items():
             values = _means(rows, key, cameras, condition)

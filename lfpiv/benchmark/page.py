@@ -115,7 +115,7 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
 
 def completeness_panel(scores: Sequence[Score]) -> str:
     """Draw the errors of all results over the part of the measurable region."""
-    figure, (axes,) = svg.new_panel(3.0)
+    figure, axes = svg.new_panel(3.0)
     for number, one in enumerate(scores):
         if len(one.curve.part):
             axes.plot(
@@ -158,7 +158,7 @@ def map_panel(score: Score, top: float) -> str:
     near = np.abs(z - middle) <= reach
     length = np.linalg.norm(pair.error, axis=1)
     good, bad = near & pair.kept, near & ~pair.kept
-    figure, (axes,) = svg.new_panel(3.7)
+    figure, axes = svg.new_panel(3.7)
     shown = axes.scatter(x[good], y[good], c=length[good], cmap="viridis", vmin=0, vmax=top, marker="s", s=_side(good))
     axes.scatter(x[bad], y[bad], color=svg.INK, marker="x", s=9, lw=0.7)
     axes.set_aspect("equal")
@@ -174,7 +174,7 @@ def _side(good: np.ndarray) -> float:
 
 def response_panel(score: Score, axis: int) -> str:
     """Draw one component of the measured displacements against the true one."""
-    figure, (axes,) = svg.new_panel(2.8)
+    figure, axes = svg.new_panel(2.8)
     sample = score.sample
     chosen = np.flatnonzero(sample.scored)
     chosen = chosen[:: max(1, -(-len(chosen) // POINTS))]

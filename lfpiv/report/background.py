@@ -59,7 +59,7 @@ def _picture(light: np.ndarray, found: StandingLight, title: str) -> str:
     top = max(float(np.percentile(light, 99.9)), 1.0)
     shown = np.where(found.unusable, top, light)[:rows, :columns]
     small = shown.reshape(rows // step, step, columns // step, step).max((1, 3))
-    figure, (axes,) = new_panel(float(np.clip(3.0 * rows / columns, 1.0, 3.6)) + 0.8)
+    figure, axes = new_panel(float(np.clip(3.0 * rows / columns, 1.0, 3.6)) + 0.8)
     picture = axes.imshow(
         small, cmap="magma", norm=Normalize(0, top), extent=(0, columns, rows, 0), interpolation="none"
     )

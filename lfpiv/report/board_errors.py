@@ -65,7 +65,7 @@ def depth_panel(board: BoardErrors) -> str:
     """Draw fitted minus stated depth of each plane, with standard errors."""
     order = np.argsort(board.planes_mm)
     order = order[np.isfinite(board.plane_std[order, 2])]
-    figure, (axes,) = new_panel(2.4)
+    figure, axes = new_panel(2.4)
     axes.axhline(0, color=INK, linewidth=0.8)
     off, std = 1e3 * board.plane[order, 2], 1e3 * board.plane_std[order, 2]
     axes.errorbar(board.planes_mm[order], off, yerr=std, fmt="o", color=SERIES[0], markersize=4, capsize=3)

@@ -251,7 +251,7 @@ def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
 def lens_residuals(found: LensMap, shape: tuple[int, int]) -> str:
     """Draw the distance of microimages from their lattice over the sensor: rms as colour, mean as arrows."""
     rows, columns = shape
-    figure, (axes,) = new_panel(2.5 if columns >= rows else 3.4)
+    figure, axes = new_panel(2.5 if columns >= rows else 3.4)
     extent = (-0.5, columns - 0.5, rows - 0.5, -0.5)
     shown = axes.imshow(found.rms_px, cmap="viridis", extent=extent, interpolation="none", vmin=0)
     longest = float(np.nanmax(np.hypot(*np.moveaxis(found.mean_px, -1, 0)), initial=0.0))
@@ -275,7 +275,7 @@ def white_crop(white: np.ndarray, optics: Optics, lattice: LensLattice, corner: 
     size = crop_edge(white.shape, optics)
     row, column = corner
     crop = white[row : row + size, column : column + size]
-    figure, (axes,) = new_panel(3.1)
+    figure, axes = new_panel(3.1)
     extent = (column - 0.5, column + size - 0.5, row + size - 0.5, row - 0.5)
     top = max(float(np.percentile(crop, 99.5)), 1e-9)
     axes.imshow(crop, cmap="gray", extent=extent, vmin=0, vmax=top, interpolation="none")
@@ -308,7 +308,7 @@ def board_photo(image: np.ndarray, outlines_px: np.ndarray, measured: np.ndarray
     shrink = min(PHOTO_WIDTH / max(crop.shape), 1.0)
     if shrink < 1:
         crop = cv2.resize(crop, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    figure, (axes,) = new_panel(float(np.clip(3.2 * (bottom - top) / (right - left), 1.6, 3.4)) + 0.5)
+    figure, axes = new_panel(float(np.clip(3.2 * (bottom - top) / (right - left), 1.6, 3.4)) + 0.5)
     extent = (left - 0.5, right + 0.5, bottom + 0.5, top - 0.5)
     axes.imshow(crop, cmap="gray", extent=extent, vmin=0, vmax=1, interpolation="none")
     for outline, good in zip(outlines_px, measured, strict=True):
@@ -328,7 +328,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
     first, rms = rms_by(key, dots.error)
     up = 2 if depth else 1
     at = dots.position_mm[first][:, [0, up]]
-    figure, (axes,) = new_panel(2.8)
+    figure, axes = new_panel(2.8)
     side = 150 / (1 + max(len(np.unique(column)) for column in at.T))
     shown = axes.scatter(
         *at.T,
@@ -359,7 +359,7 @@ def mapping_field(dots: DotMap, board_dots: tuple[int, int], grid: Grid, *, dept
 
 def error_histogram(errors_pitch: np.ndarray) -> str:
     """Draw a histogram of the errors of held-out labels [microlens pitch]."""
-    figure, (axes,) = new_panel(2.8)
+    figure, axes = new_panel(2.8)
     largest = max(float(np.percentile(errors_pitch, 99.5)), 1e-9)
     axes.hist(errors_pitch, np.linspace(0, largest, BINS + 1), color=SERIES[0], alpha=0.8)
     mean = float(errors_pitch.mean())

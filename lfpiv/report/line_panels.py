@@ -35,7 +35,7 @@ def profile_panel(fields: xr.Dataset, kinds: dict[str, Quantity], view: View, vo
     error = np.zeros(len(position))
     if "uncertainty" in line:
         error = np.nan_to_num(BAND * voxel * line["uncertainty"].values)
-    figure, (axes,) = new_panel(2.6)
+    figure, axes = new_panel(2.6)
     axes.axhline(0, color=INK, linewidth=0.6)
     for k, (name, dashes) in enumerate(zip("uvw", ("-", "--", ":"), strict=True)):
         values = np.where(line["masked"].values, np.nan, line[name].values)
@@ -68,7 +68,7 @@ def displacement_histogram(vectors: xr.Dataset, axis: str) -> tuple[str, np.ndar
     values = vectors[f"displacement_{axis}"].values[vectors["valid"].values]
     values = values[np.isfinite(values)]
     counts, edges = np.histogram(values, int(np.clip(np.sqrt(values.size), 8, 60)))
-    figure, (axes,) = new_panel(2.2)
+    figure, axes = new_panel(2.2)
     axes.stairs(counts, edges, fill=True, color=SERIES["xyz".index(axis)], alpha=0.8)
     style(axes, title=f"along {axis}", xlabel="displacement [voxel]", ylabel="vectors")
     spread_ticks(axes)
@@ -79,7 +79,7 @@ def uncertainty_histogram(uncertainty: np.ndarray) -> str:
     """Draw a histogram of uncertainties [voxel], with their median. The last bar holds all larger ones."""
     median = float(np.median(uncertainty))
     top = max(min(float(np.percentile(uncertainty, 99.5)), TAIL * median), 1e-9)
-    figure, (axes,) = new_panel(2.6)
+    figure, axes = new_panel(2.6)
     axes.hist(
         np.minimum(uncertainty, top),
         np.linspace(0, top, int(np.clip(np.sqrt(uncertainty.size), 8, 50)) + 1),
@@ -97,7 +97,7 @@ def uncertainty_over_depth(vectors: xr.Dataset) -> str:
     """Draw the median uncertainty of the valid vectors over the depth [voxel]."""
     known = vectors["uncertainty"].where(vectors["valid"])
     middle = [float(np.nanmedian(plane)) if np.isfinite(plane).any() else np.nan for plane in known.values]
-    figure, (axes,) = new_panel(2.6)
+    figure, axes = new_panel(2.6)
     axes.plot(vectors["z"].values, middle, "o-", color=SERIES[0], lw=1.4, ms=4)
     axes.set_ylim(0, 1.15 * np.nanmax(middle) if np.isfinite(middle).any() else 1.0)
     style(axes, title="median over the depth", xlabel="z [mm]", ylabel="uncertainty [voxel]")

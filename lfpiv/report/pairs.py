@@ -148,7 +148,7 @@ def _line(
     bottom: float | None = None,
 ) -> str:
     """Plot figures over the pairs, as mean and range of each group; mark the failed pairs on the lower edge."""
-    figure, (axes,) = new_panel()
+    figure, axes = new_panel()
     middle = (groups.first + groups.last) / 2
     few = len(middle) <= 30
     for k, key in enumerate(keys):

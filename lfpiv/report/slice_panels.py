@@ -73,7 +73,7 @@ def slice_panel(
     slab = fields.isel({normal: place}).transpose(up, across)
     edges = [cell_edges(slab[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
-    figure, (axes,) = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
+    figure, axes = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
     low, high = limits(fields[quantity].values[good], kinds[quantity])
     shown = axes.imshow(
         _smooth(np.where(slab["masked"].values, np.nan, slab[quantity].values)),

@@ -11,7 +11,7 @@ import html
 import io
 import itertools
 import re
-from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import matplotlib
@@ -39,25 +39,12 @@ JPEG_QUALITY = 82
 _numbers = itertools.count(1)  # makes the identifiers of panels unique in the page
 
 
-def new_panel(height_inch: float = 2.6, *, rows: int = 1, columns: int = 1) -> tuple[Figure, np.ndarray]:
-    """Create an empty panel.
-
-    Parameters
-    ----------
-    height_inch : float
-        Height of the panel [inch].
-    rows, columns : int
-        Number of axes along each direction.
-
-    Returns
-    -------
-    figure : Figure
-    axes : ndarray of Axes, shape (rows * columns,)
-    """
+def new_panel(height_inch: float = 2.6) -> tuple[Figure, Any]:
+    """Create an empty panel of a height [inch], and its axes."""
     figure = Figure(figsize=(WIDTH_INCH, height_inch), layout="constrained")
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)
-    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+    return figure, figure.subplots()
 
 
 def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:
@@ -175,7 +162,6 @@ def cell_edges(centres: np.ndarray) -> tuple[float, float]:
     return float(centres[0]) - half, float(centres[-1]) + half
 
 
-def spread_ticks(axes: Axes, count: Sequence[int] = (5, 5)) -> None:
+def spread_ticks(axes: Axes) -> None:
     """Limit the number of ticks along x and y."""
-    axes.locator_params(axis="x", nbins=count[0])
-    axes.locator_params(axis="y", nbins=count[1])
+    axes.locator_params(nbins=5)

@@ -58,7 +58,7 @@ def _panel(shown: xr.Dataset, side: str, speed: np.ndarray, unit: str) -> str:
     """Return the view along the axis that is not named in `side`."""
     across, up = (shown[axis].values for axis in side)
     track = shown["track"].values
-    figure, (axes,) = svg.new_panel(3.2)
+    figure, axes = svg.new_panel(3.2)
     points = np.stack([across, up], axis=1)
     joined = np.flatnonzero(track[1:] == track[:-1])
     lines = LineCollection(

@@ -89,7 +89,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
     values = first[f"projection_{along}"].isel(frame=0).transpose(up, across).values
     edges = [cell_edges(first[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
-    figure, (axes,) = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
+    figure, axes = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
     shown = axes.imshow(
         values,
         cmap="magma",
@@ -169,7 +169,7 @@ def _residuals(histories: Mapping[str, np.ndarray]) -> tuple[str, str]:
         row[: len(history)] = history
         row[len(history) :] = history[-1]  # volumes that stopped earlier keep their last residual
     iteration = np.arange(length)
-    figure, (axes,) = new_panel()
+    figure, axes = new_panel()
     if len(histories) <= FEW_VOLUMES:
         for k, (label, history) in enumerate(histories.items()):
             dashes = "-" if k % 2 == 0 else "--"
@@ -204,7 +204,7 @@ def _brightness(first: xr.Dataset, sheet: LightSheet | None, frames: Sequence[st
     z = first["z"].values
     profiles = dict(zip(frames, first["profile_z"].values, strict=True))
     digits = 0 if max(profile.max() for profile in profiles.values()) >= 100 else 2
-    figure, (axes,) = new_panel()
+    figure, axes = new_panel()
     if sheet is not None:
         axes.axvspan(sheet.low_mm, sheet.high_mm, color=INK, alpha=0.15, linewidth=0)
         levels = [sheet.inside, sheet.outside]

@@ -26,7 +26,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.optics import random_on_pupil
-from lfpiv.progress import Progress, StepProgress
+from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.settings.processing import Smart
 from lfpiv.simulation.flows import Ring, window_mean
@@ -112,15 +112,13 @@ class Rig:
             raise ValueError(f"{name}: expected a camera calibrated from a board, got one without dots.")
         return dots
 
-    def weights(
-        self, grid: Grid, mapping: str, progress: StepProgress | None = None, particle_voxel: float = 0.0
-    ) -> Weights:
+    def weights(self, grid: Grid, mapping: str, particle_voxel: float = 0.0) -> Weights:
         """Build the weights of a grid by "network", or by direct ray tracing with a key of `TURNED_DEG`.
 
         `particle_voxel` is the size of the particles, as of `build_weights`.
         """
         calibration = self.calibration if mapping == "network" else self.ray_tracing(mapping)
-        return build_weights(calibration, grid, particle_voxel=particle_voxel, progress=progress)
+        return build_weights(calibration, grid, particle_voxel=particle_voxel)
 
     def ray_tracing(self, mapping: str) -> Calibration:
         """Return thin lenses at the nominal angles, turned by the errors of `TURNED_DEG`."""

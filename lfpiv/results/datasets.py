@@ -62,7 +62,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     return {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in found.items()}
 
 
-def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, Any] | None = None) -> None:
+def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     """Write a dataset of any form as NetCDF4, atomically; attributes of other types become JSON.
 
     Raises
@@ -76,7 +76,7 @@ def write_dataset(dataset: xr.Dataset, path: Path, *, attributes: Mapping[str, A
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as scratch, hdf5.written(scratch) as disk:  # it may be larger than the memory
         with h5netcdf.File(disk, "w") as file:
-            packed(dataset, attributes or {}).dump_to_store(H5NetCDFStore(file))
+            packed(dataset, {}).dump_to_store(H5NetCDFStore(file))
 
 
 def packed(dataset: xr.Dataset, attributes: Mapping[str, Any], *, root: bool = True) -> xr.Dataset:

@@ -143,16 +143,6 @@ def _check_numbers(vectors: xr.Dataset) -> None:
             raise ValueError(f"vectors: expected numbers in {name!r} where vectors are valid, {wrong} are not finite.")
 
 
-def _check_places(vectors: xr.Dataset, grid: Grid) -> None:
-    """Refuse vectors beyond the volume, or measured in other voxels."""
-    if not np.allclose(vectors.attrs["voxel_mm"], grid.voxel_mm, rtol=1e-6):
-        raise ValueError(f"vectors: expected voxels of {grid.voxel_mm:g} mm, found {vectors.attrs['voxel_mm']}.")
-    for number, axis in enumerate(AXES):
-        places, voxels = vectors[axis].values, grid.axis_mm(number)
-        if not (voxels[0] - grid.voxel_mm < places[0] and places[-1] < voxels[-1] + grid.voxel_mm):
-            raise ValueError(f"vectors: expected {axis} within the volume, found {places[0]:g} to {places[-1]:g} mm.")
-
-
 def _check_axis(axis: xr.DataArray) -> None:
     values = axis.values
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all() or not (np.diff(values) > 0).all():
@@ -215,14 +205,8 @@ def write_vectors(
     datasets.write_groups(groups, path)
 
 
-def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
+def read_vectors(path: Path) -> xr.Dataset:
     """Read the vectors of one pair into memory, verified.
-
-    Parameters
-    ----------
-    path : Path
-    grid : Grid, optional
-        The volume, in which the vectors must lie.
 
     Raises
     ------
@@ -232,8 +216,6 @@ def read_vectors(path: Path, *, grid: Grid | None = None) -> xr.Dataset:
     vectors = datasets.read_group(path)
     try:
         check_vectors(vectors)
-        if grid is not None:
-            _check_places(vectors, grid)
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
     return vectors

@@ -114,8 +114,8 @@ def run(
         done = _bootstrap(current, prepared, done, weights)
         summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
         if not isinstance(experiment, Experiment):
-            command = {"experiment": str(experiment), "pairs": pairs, "device": device, "keep_volumes": keep_volumes}
-            command |= {"workers": workers, "scheduler": scheduler}
+            command: dict[str, Any] = {"experiment": str(experiment), "pairs": pairs, "device": device}
+            command |= {"keep_volumes": keep_volumes, "workers": workers, "scheduler": scheduler}
             unchanged.record(command, current.folder, current.experiment, read, summary)
         return summary
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -246,7 +246,7 @@ def _survey(contents: Contents, folder: Folder) -> _Survey:
             if pair in contents.selected and not figures.valid_fraction > 0 and len(empty) < MOST_LISTED:
                 empty.append(pair)
             images.add(warning.of_pair(pair) for warning in figures.warnings)
-            vectors.add(_of_pair(pair, figures))
+            vectors.add(pair_warnings(pair, figures))
             for name in totals:
                 totals[name] += getattr(figures, name)
     if total <= MOST_LISTED:
@@ -364,17 +364,7 @@ def rig_warnings(calibration: Calibration, experiment: Experiment) -> list[Warni
     return [*found, Warning(code=Code.ONE_CAMERA)] if alone else found
 
 
-def image_warnings(pairs: Mapping[int, Iterable[Warning]]) -> list[Warning]:
-    """Return the warnings about the images of all pairs, given those of each pair."""
-    return gather(warning.of_pair(pair) for pair, warnings in pairs.items() for warning in warnings)
-
-
-def pair_warnings(pairs: Mapping[int, PairFigures]) -> list[Warning]:
-    """Return the warnings about volumes and vectors of finished pairs, given the figures of each pair."""
-    return gather(warning for pair, figures in pairs.items() for warning in _of_pair(pair, figures))
-
-
-def _of_pair(pair: int, figures: PairFigures) -> Iterator[Warning]:
+def pair_warnings(pair: int, figures: PairFigures) -> Iterator[Warning]:
     """Yield the warnings about volumes and vectors of a pair."""
     if figures.stop is not None and SmartStop.DIVERGED.value in figures.stop.values():
         yield Warning(code=Code.DIVERGED, pairs=(pair,), figures={"verdict": SmartStop.DIVERGED.value})

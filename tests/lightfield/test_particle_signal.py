@@ -7,9 +7,9 @@ from scipy.ndimage import gaussian_filter
 import lfpiv
 from lfpiv.lightfield.image_checks import signal_warnings
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE, seen_structure, structure
-from lfpiv.runs import summary
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import simulate
+from lfpiv.warn import gather
 
 PARTICLES = 4 * NOISE  # least structure of particles; 0.27 and more at ten times the noise
 
@@ -115,7 +115,7 @@ def test_noise_of_every_kind_is_noise(tmp_path, device):
 
 def test_images_without_particles_and_dim_ones_are_named():
     found = signal_warnings({"left": 0.6, "right": 0.001}, "b") + signal_warnings({"left": 0.03}, "a")
-    gathered = summary.image_warnings({3: found, 4: []})
+    gathered = gather(warning.of_pair(3) for warning in found)
     dim, empty = (warning.sentence for warning in gathered)
     assert empty.startswith("right, frame b, pair 3: no particles, only noise") and "0.001" in empty
     assert dim.startswith("left, frame a, pair 3: particles hardly rise above the noise") and "0.03" in dim
