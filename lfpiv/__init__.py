@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.calibration.camera import load_calibration as load_calibration
     from lfpiv.calibration.cameras import calibrate as calibrate
     from lfpiv.calibration.cameras import thin_lens as thin_lens
+    from lfpiv.damping.bootstrap import measure_damping as measure_damping
     from lfpiv.errors import InputError as InputError
     from lfpiv.experiment.experiment import Experiment as Experiment
     from lfpiv.experiment.opening import open_experiment as open_experiment
@@ -29,7 +30,6 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.planning.campaign import plan as plan
-    from lfpiv.reconstruction.bootstrap import measure_damping as measure_damping
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
@@ -64,7 +64,7 @@ _MODULES = {
     "find_particles": "lfpiv.tracking.finding",
     "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
-    "measure_damping": "lfpiv.reconstruction.bootstrap",
+    "measure_damping": "lfpiv.damping.bootstrap",
     "measure_pair": "lfpiv.runs.measurement",
     "open_experiment": "lfpiv.experiment.opening",
     "open_results": "lfpiv.results.reader",

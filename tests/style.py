@@ -59,7 +59,9 @@ MAY_IMPORT = {
     "weights": {"calibration", "lightfield"},
     "reconstruction": {"weights", "calibration", "lightfield", "velocity"},
     "tracking": {"reconstruction", "weights", "calibration", "metrics", "velocity"},
-    "joint": {"reconstruction", "weights", "velocity"},
+    "sequence": {"reconstruction", "weights", "velocity"},
+    "damping": {"reconstruction", "weights", "calibration", "velocity"},
+    "joint": {"sequence", "reconstruction", "weights", "velocity"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
     "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
 }

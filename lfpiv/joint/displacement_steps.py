@@ -123,7 +123,7 @@ class DisplacementSteps:
         for number, (frame, transport) in enumerate(zip(model.frames, transports, strict=True)):
             projected = model.weights(model.volume(number, light, transport))
             logs, curves, misfit, squares, norm = {}, {}, 0.0, 0.0, 0.0
-            for name, one in frame.recordings.items():
+            for name, one in frame.images.items():
                 gain, floor = np.float32(one.camera_gain), np.float32(one.floor)
                 expected = projected[name] * gain
                 image = one.image.reshape(expected.shape)
@@ -156,9 +156,7 @@ class DisplacementSteps:
         """Return the map from a change of the nodes to a change of the gradient."""
         model = self.model
         own = [model.light_of(number, light) for number in range(2)]
-        shares = [
-            self._part.share({name: one.image for name, one in frame.recordings.items()}) for frame in model.frames
-        ]
+        shares = [self._part.share({name: one.image for name, one in frame.images.items()}) for frame in model.frames]
 
         def change(nodes: np.ndarray) -> np.ndarray:
             direction, total = model.field.values(nodes), np.zeros((3, *light.shape), np.float32)
@@ -198,7 +196,7 @@ class DisplacementSteps:
 
     @property
     def _lit_pixels(self) -> int:
-        images = (one.image for frame in self.model.frames for one in frame.recordings.values())
+        images = (one.image for frame in self.model.frames for one in frame.images.values())
         return sum(int(np.count_nonzero(image > 0)) for image in images)
 
     def _curvature_scale(self, curvature: Callable[[np.ndarray], np.ndarray], nodes: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ class LightSteps:
 
     def __init__(self, model: JointModel):
         self.model = model
-        self.partitions = tuple(_partition(frame.normalisation, len(frame.recordings)) for frame in model.frames)
+        self.partitions = tuple(_partition(frame.normalisation, len(frame.images)) for frame in model.frames)
         """Subsets of both frames' rays."""
 
     def epochs(self, light: Light, transports: tuple[Transport, Transport], count: int) -> Light:

@@ -55,7 +55,7 @@ class JointModel:
         self.field = SplineField(weights.grid)
         self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel
         light = [
-            sum(float(one.image.sum(dtype=np.float64)) / one.camera_gain for one in frame.recordings.values())
+            sum(float(one.image.sum(dtype=np.float64)) / one.camera_gain for one in frame.images.values())
             for frame in frames
         ]
         self.power = [np.float32(own / math.sqrt(light[0] * light[1])) for own in light]

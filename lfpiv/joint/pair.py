@@ -23,10 +23,10 @@ from lfpiv.geometry.resampling import volume_on
 from lfpiv.joint.fit import JointFit, fit_pair
 from lfpiv.joint.model import JointModel
 from lfpiv.reconstruction.frame import PreparedFrame
-from lfpiv.reconstruction.motion_field import LEAST_VALID
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver, Volume
+from lfpiv.sequence.motion_field import LEAST_VALID
 from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.warn import collected

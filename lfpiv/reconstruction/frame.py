@@ -13,10 +13,10 @@ import numpy as np
 from lfpiv.reconstruction.dark_voxels import DARK
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
+from lfpiv.reconstruction.image_preparation import PreparedImage
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
 from lfpiv.reconstruction.ordered_subsets import Epoch, Partition, Subset, iterate_epochs
-from lfpiv.reconstruction.recording import Recording
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State, iterate
@@ -33,7 +33,7 @@ class PreparedFrame:
 
     stored: StoredGrid
     settings: SmartSettings
-    recordings: Mapping[str, Recording]
+    images: Mapping[str, PreparedImage]
     normalisation: LensSubsets | RowSubsets
     intensity_cap: float
     solid: np.ndarray | None
@@ -147,9 +147,9 @@ class PreparedFrame:
             residual=tuple(float(np.sqrt(squares)) / self._norm for squares in history.squares),
             misfit=tuple(history.divergence),
             stop=stop,
-            floor={name: one.floor for name, one in self.recordings.items()},
-            camera_gain={name: one.camera_gain for name, one in self.recordings.items()},
-            light_outside={name: one.light_outside for name, one in self.recordings.items()},
+            floor={name: one.floor for name, one in self.images.items()},
+            camera_gain={name: one.camera_gain for name, one in self.images.items()},
+            light_outside={name: one.light_outside for name, one in self.images.items()},
             sieve_voxel=self.normalisation.sieve.sigma_voxel,
             intensity_cap=self.intensity_cap,
             settings=self.settings,
@@ -221,7 +221,7 @@ class PreparedFrame:
 
     def _guessed(self, subset: Subset | None = None, sums: DeviceArray | None = None) -> DeviceArray:
         """Return `multiplicative_guess` of the images by all rays, or by a subset with its sums of weights."""
-        peaks, normal = [one.peak for one in self.recordings.values()], self.normalisation
+        peaks, normal = [one.peak for one in self.images.values()], self.normalisation
         return multiplicative_guess(
             self.equations.comparisons, peaks, normal.column_sum, normal.lit, normal.shown, subset=subset, sums=sums
         )
@@ -229,13 +229,13 @@ class PreparedFrame:
     @cached_property
     def _norm(self) -> float:
         """Euclidean norm of all images [counts]."""
-        images = (one.image for one in self.recordings.values())
+        images = (one.image for one in self.images.values())
         return float(np.sqrt(sum(np.einsum("i,i", image, image, dtype=np.float64) for image in images)))
 
     @cached_property
     def _light(self) -> float:
         """Sum of the counts of all images."""
-        return sum(float(one.image.sum(dtype=np.float64)) for one in self.recordings.values())
+        return sum(float(one.image.sum(dtype=np.float64)) for one in self.images.values())
 
     def _solve_whole(
         self,

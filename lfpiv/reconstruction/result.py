@@ -12,9 +12,12 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.volume import MASKED, VIEWS
-from lfpiv.reconstruction.motion_field import SMOOTHING_VOXEL
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv_kernels.correlation import deform, light
+
+SMOOTHING_VOXEL = 0.7
+"""Standard deviation of the Gaussian that smooths volumes before they are compared [voxel]: about the size of a
+particle."""
 
 
 class SmartStop(enum.Enum):

@@ -11,11 +11,11 @@ import xarray as xr
 from lfpiv.geometry.volume import checked_mask
 from lfpiv.reconstruction.depth_spread import rows_resolve_depth
 from lfpiv.reconstruction.frame import PreparedFrame
+from lfpiv.reconstruction.image_preparation import checked_images, prepare_images
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP
 from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
 from lfpiv.reconstruction.ordered_subsets import Subset, joint_subsets, subsets_of, whole_subset
 from lfpiv.reconstruction.particle_size import UNLIKE, ParticleSizer
-from lfpiv.reconstruction.recording import checked_images, record
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
@@ -76,8 +76,8 @@ class SmartSolver:
         solid = None if mask is None else checked_mask(mask, self.weights.grid.axes_mm)
         sieve, cap = self._sieve_and_cap(images)
         share = self.settings.floor_share
-        recordings = record(self.weights, images, floor=floor, floor_share=share, intensity_cap=cap)
-        normalisation = self._normalisation({name: one.camera_gain for name, one in recordings.items()}, sieve, solid)
+        prepared = prepare_images(self.weights, images, floor=floor, floor_share=share, intensity_cap=cap)
+        normalisation = self._normalisation({name: one.camera_gain for name, one in prepared.items()}, sieve, solid)
         equations = ImageEquations(
             [
                 CameraEquation(
@@ -86,13 +86,13 @@ class SmartSolver:
                     floor=one.floor,
                     projector=self.weights.projector(name),
                 )
-                for name, one in recordings.items()
+                for name, one in prepared.items()
             ]
         )
         return PreparedFrame(
             stored=self.weights.stored,
             settings=self.settings,
-            recordings=recordings,
+            images=prepared,
             normalisation=normalisation,
             intensity_cap=cap,
             solid=solid,

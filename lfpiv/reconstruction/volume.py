@@ -45,7 +45,7 @@ def reconstruct(
     images : mapping of str to ndarray
         Camera name -> image, shape (rows, columns) [counts], background subtracted. Negative counts are taken as zero.
         Pixels that no voxel lights are left out. Differences of the cameras' brightness are measured and corrected
-        (`lfpiv.reconstruction.recording`).
+        (`lfpiv.reconstruction.image_preparation`).
     iterations : int
         Largest number of iterations, >= 0.
     floor : float or mapping of str to float, optional

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv.reconstruction.recording import DIMMEST
+from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts

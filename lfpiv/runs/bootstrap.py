@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
+from lfpiv.damping.bootstrap import evenly_spread, measure_damping
 from lfpiv.errors import InputError
 from lfpiv.files import writing
 from lfpiv.geometry.grid import AXES
 from lfpiv.progress import StepProgress
-from lfpiv.reconstruction.bootstrap import evenly_spread, measure_damping
 from lfpiv.results import netcdf, stored_damping
 from lfpiv.results.provenance import Stamp
 from lfpiv.results.stored_damping import StoredDamping

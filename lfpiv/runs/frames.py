@@ -28,8 +28,8 @@ from lfpiv.runs.frame_light import FrameLight, compare
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
     from lfpiv.experiment.experiment import Experiment
-    from lfpiv.reconstruction.sequence import Before
     from lfpiv.runs.pair_volumes import Followed
+    from lfpiv.sequence.solver import Before
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)

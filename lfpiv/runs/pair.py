@@ -25,7 +25,6 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.sequence import Before
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs import belonging, pair_figures
@@ -38,6 +37,7 @@ from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
 from lfpiv.runs.particles import FrameFits, refused, track
 from lfpiv.runs.sequences import FollowedFrames
 from lfpiv.runs.side_threads import ReadAhead, Writer
+from lfpiv.sequence.solver import Before
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.link_vectors import vectors_from_links
 from lfpiv.velocity.cross_correlation import Verdict

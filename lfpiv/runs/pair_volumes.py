@@ -24,10 +24,10 @@ from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import VIEWS
 from lfpiv.joint.pair import Estimate, PairSolver
 from lfpiv.progress import StepProgress
-from lfpiv.reconstruction.sequence import Before, SequenceSolver, Solved, Start
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
+from lfpiv.sequence.solver import Before, SequenceSolver, Solved, Start
 from lfpiv.settings.processing import Correlation
 from lfpiv.warn import Code, Warning
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lfpiv.reconstruction.bootstrap import evenly_spread
+from lfpiv.damping.bootstrap import evenly_spread
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.warn import Code, Warning
 

@@ -20,11 +20,11 @@ from lfpiv.experiment import segments
 from lfpiv.experiment.recording import Frame
 from lfpiv.experiment.segments import corrected_by, followed, segment_of
 from lfpiv.progress import StepProgress, part_of
-from lfpiv.reconstruction.sequence import Before, Start
 from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.frames import Failure, Frames, FrameWork, HeldFrame, attempted
 from lfpiv.runs.pair_volumes import Followed
+from lfpiv.sequence.solver import Before, Start
 from lfpiv.warn import Code, Warning
 
 

@@ -149,10 +149,10 @@ class ImageFit:
         prepared = self._solver.prepare(images)
         projected = self.weights(prepared.solve().volume)
         found = []
-        for name, recording in prepared.recordings.items():
+        for name, prepared_image in prepared.images.items():
             pixels, part, count = self._parts[name]
-            floor, image = np.float32(recording.floor), recording.image[pixels]
-            expected = np.float32(recording.camera_gain) * projected[name].ravel()[pixels]
+            floor, image = np.float32(prepared_image.floor), prepared_image.image[pixels]
+            expected = np.float32(prepared_image.camera_gain) * projected[name].ravel()[pixels]
             left = (np.sqrt(image + floor) - np.sqrt(expected + floor)) ** 2
             found.append(np.bincount(part, left, count) / max(float(image.sum(dtype=float)), 1e-30))
         return np.concatenate(found)

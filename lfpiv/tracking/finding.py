@@ -19,8 +19,8 @@ import xarray as xr
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import is_finite, lies_in
 from lfpiv.reconstruction.dark_noise import dark_noise
+from lfpiv.reconstruction.image_preparation import checked_images
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.recording import checked_images
 from lfpiv.settings.processing import Tracking
 from lfpiv.tracking import candidates, confirmation
 from lfpiv.tracking.fit import Fit, faint_light, scene_of

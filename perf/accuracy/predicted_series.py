@@ -27,7 +27,6 @@ from lfpiv import metrics
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.reconstruction import instant, sequence
 from lfpiv.reconstruction.frame import PreparedFrame
-from lfpiv.reconstruction.sequence import SequenceSolver
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.runs import rig
 from lfpiv.runs.pair import PairWork
@@ -35,6 +34,7 @@ from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import open_run
 from lfpiv.runs.sequences import Segment
+from lfpiv.sequence.solver import SequenceSolver
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
 from lfpiv.simulation.simulator import simulate

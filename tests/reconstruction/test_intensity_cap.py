@@ -6,9 +6,9 @@ from support import plain_steps
 from support.ideal_rig import two_cameras
 
 import lfpiv
+from lfpiv.reconstruction.image_preparation import prepare_images
 from lfpiv.reconstruction.intensity_cap import CAP, POINT_CAP, typical_peak
 from lfpiv.reconstruction.particle_size import ParticleSizer
-from lfpiv.reconstruction.recording import record
 
 NOISE = 2.0  # [counts]
 PITCH_PX = 18.2
@@ -70,7 +70,9 @@ def quality(weights, images, truth, cap):
 @pytest.mark.slow
 def test_counts_are_limited_by_each_pixel_s_gain_and_dim_ones_stay(weights):
     _, images = scene(weights, 1.0, 1)
-    before, after = (record(weights, images, floor=None, floor_share=0.1, intensity_cap=cap) for cap in (0.0, CAP))
+    before, after = (
+        prepare_images(weights, images, floor=None, floor_share=0.1, intensity_cap=cap) for cap in (0.0, CAP)
+    )
     for name, image in images.items():
         pitch = weights.cameras[name].optics.microimage_pitch_px
         peak = typical_peak(before[name].image.reshape(image.shape), pitch, NOISE)

@@ -53,7 +53,7 @@ def test_misfits_of_some_rays_stand_for_those_of_all(recorded, sieve_voxel):
             return equations.compare(to_device(coefficients, float))
 
     def norm(found):
-        images = (one.image.astype(float) for one in prepared.recordings.values())
+        images = (one.image.astype(float) for one in prepared.images.values())
         return np.sqrt(found.squares / sum((image**2).sum() for image in images))
 
     sieved = normal.sieve(to_device(prepared.stored.store(guess), float))
@@ -124,7 +124,7 @@ def test_a_guess_by_a_part_of_the_rays_equals_its_twin(recorded, sieve_voxel):
     names, (subset,) = list(weights.cameras), normal.correcting.subsets
     logarithm, total = (np.zeros(weights.grid.size, np.float32) for _ in range(2))
     for camera, ray_set in subset.parts:
-        one, projector = prepared.recordings[names[camera]], weights.projector(names[camera])
+        one, projector = prepared.images[names[camera]], weights.projector(names[camera])
         gain = weights.gain(names[camera]) * np.float32(one.camera_gain)
         floor = max(one.floor, LEAST_FLOOR_SHARE * one.peak)
         projector.back_project(gain * np.log1p(one.image / np.float32(floor)), logarithm, ray_set)

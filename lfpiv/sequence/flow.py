@@ -13,7 +13,7 @@ from typing import Any
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.reconstruction.motion_field import MotionField
+from lfpiv.sequence.motion_field import MotionField
 from lfpiv.settings.processing import DEFAULT_WINDOWS
 from lfpiv.velocity.cross_correlation import GOOD_SHARE, correlate
 from lfpiv.velocity.multi_pass import correlate_known

@@ -1,6 +1,6 @@
 """Correct the volumes of a time series by those before and after each: a smoother of fixed lag.
 
-`lfpiv.reconstruction.sequence` follows particles forward in time, so that a volume holds what the frames before it
+`lfpiv.sequence.solver` follows particles forward in time, so that a volume holds what the frames before it
 show. The frames after it show as much again. Here the volumes of a few frames on each side are moved along the
 flow to the present one, as in simultaneous motion tracking enhancement [1]_. Particles are in all of them. A ghost
 moves with the mean of the particles whose lines of sight cross in it, so it is elsewhere in most of them.
@@ -25,9 +25,9 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.dark_voxels import without_dark
-from lfpiv.reconstruction.motion_field import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import coefficients
+from lfpiv.sequence.motion_field import FAINTEST, LARGEST_GAIN, MotionField
 from lfpiv_kernels import runtime
 
 SHARPNESS = 1.3

@@ -9,8 +9,8 @@ from scipy import ndimage
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.reconstruction import fixed_lag
-from lfpiv.reconstruction.motion_field import SMOOTHING_VOXEL
+from lfpiv.reconstruction.result import SMOOTHING_VOXEL
+from lfpiv.sequence import fixed_lag
 from lfpiv_kernels.correlation import deform
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.0, 0.0, 0.0), size_mm=(2.4, 2.0, 1.6), voxel_mm=0.1)

@@ -11,11 +11,11 @@ from support.ideal_rig import optics, two_cameras
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.reconstruction import sequence
-from lfpiv.reconstruction.sequence import Before, SequenceSolver, Start
 from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.sequence import solver as sequence
+from lfpiv.sequence.solver import Before, SequenceSolver, Start
 from lfpiv.simulation.flows import Swirl, Uniform
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.4, 2.0), voxel_mm=0.1)

@@ -17,8 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
+from lfpiv.damping.particle_images import ParticleImager
 from lfpiv.geometry.grid import Grid
-from lfpiv.reconstruction.particle_images import ParticleImager
 from lfpiv.reconstruction.particle_size import LIT_SHARE, SubApertures
 from lfpiv.weights.operator import Images, Weights
 

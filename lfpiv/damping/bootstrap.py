@@ -17,11 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from lfpiv.damping.likely_flow import LikelyFlow
+from lfpiv.damping.particle_light import LightField
+from lfpiv.damping.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
 from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.dark_noise import dark_noise
-from lfpiv.reconstruction.likely_flow import LikelyFlow
-from lfpiv.reconstruction.particle_light import LightField
-from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
 from lfpiv.velocity.damping import Damping, displacement
 from lfpiv.velocity.damping_estimate import Simulated, estimate_damping
 from lfpiv.velocity.imposed_field import ImposedField

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from lfpiv.reconstruction.likely_flow import LikelyFlow
+from lfpiv.damping.likely_flow import LikelyFlow
 from lfpiv.velocity.damping_estimate import Simulated
 
 SLOPE, NOISE = 0.8, 0.15

@@ -6,7 +6,7 @@ from support import plain_steps
 from support.ideal_rig import IdealCamera, IdealRig, optics, rotation, two_cameras
 
 import lfpiv
-from lfpiv.reconstruction import recording
+from lfpiv.reconstruction import image_preparation
 from lfpiv.reconstruction.intensity_cap import CAP
 
 NOISE = 2.0  # [counts]
@@ -16,7 +16,7 @@ TOLERANCE_SHARE = 0.02  # signed noise of 190,000 pixels, 0.5 % of 1e6 counts of
 LEAST_LOSS = (
     0.025  # of Q, by the noise of a camera that is 10 times dimmer: 0.021 here; its brightness untold costs 0.046
 )
-HALF_STEP = np.log(recording.GAIN_STEP) / 2
+HALF_STEP = np.log(image_preparation.GAIN_STEP) / 2
 
 
 def particles(grid, seed, per_voxel=0.01, size=0.7):
@@ -103,7 +103,7 @@ def test_images_cut_off_at_0_are_prepared_as_those_that_are_not(weights, cap):
     """Their noise is as well known, so it lights no dark microimages, and the limit cuts no more light."""
     images = recorded(weights, particles(weights.grid, 7), 7)
     signed, cut = (
-        recording.record(weights, seen, floor=None, floor_share=0.0, intensity_cap=cap)
+        image_preparation.prepare_images(weights, seen, floor=None, floor_share=0.0, intensity_cap=cap)
         for seen in (images, {name: np.maximum(image, 0) for name, image in images.items()})
     )
     for name, one in cut.items():
@@ -117,7 +117,7 @@ def test_a_camera_s_brightness_is_part_of_its_gain(weights):
     """Brightness and floor scale with it: the same as a camera of which the white image says so, in its own counts."""
     images = recorded(weights, particles(weights.grid, 2), 2)
     assert plain_steps.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
-    gain = np.float32(recording.GAIN_STEP**-6)
+    gain = np.float32(image_preparation.GAIN_STEP**-6)
     for name in images:
         dim = images | {name: images[name] * gain}
         found = plain_steps.reconstruct(weights, dim, 10)

@@ -41,7 +41,7 @@ UNSURE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording:
+class PreparedImage:
     """Image of one camera, prepared for SMART."""
 
     image: np.ndarray
@@ -69,19 +69,19 @@ def checked_images(weights: Weights, images: Mapping[str, np.ndarray]) -> dict[s
     return {name: _checked_image(images, name, camera.optics.sensor_shape) for name, camera in weights.cameras.items()}
 
 
-def record(
+def prepare_images(
     weights: Weights,
     images: Mapping[str, np.ndarray],
     *,
     floor: float | Mapping[str, float] | None,
     floor_share: float,
     intensity_cap: float = 0.0,
-) -> dict[str, Recording]:
+) -> dict[str, PreparedImage]:
     """Prepare the images of all cameras, from `checked_images`; arguments as of `lfpiv.reconstruct`.
 
     Returns
     -------
-    dict of Recording
+    dict of PreparedImage
         By camera name.
 
     Raises
@@ -92,17 +92,17 @@ def record(
     given = _given_floors(floor, weights)
     lit = _lit_pixels(weights, images, intensity_cap)
     gains = _camera_gains(weights, lit)
-    recordings = {}
+    prepared = {}
     for name, seen in lit.items():
         noise, least = (seen.noise, LEAST_FLOOR) if given is None else (given[name], LEAST_GIVEN)
-        recordings[name] = Recording(
+        prepared[name] = PreparedImage(
             image=seen.image,
             floor=max(noise, least * seen.peak, floor_share * seen.brightness),
             peak=seen.peak,
             camera_gain=gains[name],
             light_outside=seen.outside,
         )
-    return recordings
+    return prepared
 
 
 class _LitPixels:

@@ -8,7 +8,7 @@ from support import plain_steps
 
 import lfpiv
 from lfpiv import metrics
-from lfpiv.reconstruction import flow
+from lfpiv.sequence import flow
 from lfpiv.simulation.flows import Swirl
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.8, 2.6, 2.4), voxel_mm=0.1)

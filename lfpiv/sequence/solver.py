@@ -10,7 +10,7 @@ exponent p = `PERSISTENCE` where the flow is known, and 0 elsewhere. SMART multi
 images do not determine is forgotten by the factor p in each frame. Particles that enter through a face come from F.
 
 So the volumes go forward in time. Afterwards each is corrected by the volumes on both sides of it
-(`lfpiv.reconstruction.fixed_lag`), which changes no other one.
+(`lfpiv.sequence.fixed_lag`), which changes no other one.
 
 .. [1] M. Novara, K. J. Batenburg, F. Scarano, "Motion tracking-enhanced MART for tomographic PIV", Meas. Sci. Technol.
    21 (2010) 035401, doi:10.1088/0957-0233/21/3/035401.
@@ -31,13 +31,13 @@ import xarray as xr
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.reconstruction.dark_voxels import without_dark
-from lfpiv.reconstruction.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
-from lfpiv.reconstruction.flow import measure_flow
 from lfpiv.reconstruction.frame import PreparedFrame
-from lfpiv.reconstruction.motion_field import LEAST_VALID, MotionField
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
+from lfpiv.sequence.fixed_lag import ROUGHEST, agreed_guess, mean_flow, roughness
+from lfpiv.sequence.flow import measure_flow
+from lfpiv.sequence.motion_field import LEAST_VALID, MotionField
 from lfpiv.settings.processing import Correlation
 from lfpiv_kernels import runtime
 from lfpiv_kernels.correlation import deform
@@ -135,9 +135,9 @@ class SequenceSolver:
         Solver of each frame. One that starts from the frame before has `ITERATION_SHARE` of its iterations.
     correlation : mapping, optional
         Settings of `correlate`, which measures the flow; default: those of an experiment without such a table. Windows
-        that are None are those of `lfpiv.reconstruction.flow`.
+        that are None are those of `lfpiv.sequence.flow`.
     measure : callable, optional
-        Replaces `lfpiv.reconstruction.flow.measure_flow`, for a caller that knows the flow.
+        Replaces `lfpiv.sequence.flow.measure_flow`, for a caller that knows the flow.
     """
 
     def __init__(

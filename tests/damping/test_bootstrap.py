@@ -6,10 +6,10 @@ from support import plain_steps
 from support.ideal_rig import lattice, optics, two_cameras
 
 import lfpiv
-from lfpiv.reconstruction import particle_images
-from lfpiv.reconstruction.bootstrap import evenly_spread, measure_damping
-from lfpiv.reconstruction.particle_images import ParticleImager
-from lfpiv.reconstruction.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair, random_places
+from lfpiv.damping import particle_images
+from lfpiv.damping.bootstrap import evenly_spread, measure_damping
+from lfpiv.damping.particle_images import ParticleImager
+from lfpiv.damping.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair, random_places
 
 VOXEL_MM = 0.1
 GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.0, 2.0, 1.6), voxel_mm=VOXEL_MM)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.reconstruction.particle_light import LightField
+from lfpiv.damping.particle_light import LightField
 
 EDGE_MM = 3.2
 

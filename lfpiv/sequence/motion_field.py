@@ -13,9 +13,6 @@ from lfpiv.velocity.predictor import Predictor
 from lfpiv.velocity.validation import fill
 from lfpiv_kernels.correlation.carry import carry, followed
 
-SMOOTHING_VOXEL = 0.7
-"""Standard deviation of the Gaussian that smooths volumes before they are compared [voxel]: about the size of a
-particle."""
 LARGEST_GAIN = 3.0
 """Largest factor by which the other frame brightens a voxel."""
 FAINTEST = 1e-6

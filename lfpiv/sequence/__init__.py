@@ -1,0 +1,1 @@
+"""Volumes of a time series, each frame from those before and after it."""
