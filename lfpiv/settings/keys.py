@@ -71,10 +71,11 @@ def field_meanings(model: type[BaseModel]) -> dict[str, str]:
     for parent in reversed(model.__mro__):
         if not (isinstance(parent, type) and issubclass(parent, BaseModel)) or parent is BaseModel:
             continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(parent))).body[0].body
-        for field, text in itertools.pairwise(body):
+        (table,) = ast.parse(textwrap.dedent(inspect.getsource(parent))).body
+        assert isinstance(table, ast.ClassDef)
+        for field, text in itertools.pairwise(table.body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                meanings[field.target.id] = " ".join(inspect.cleandoc(text.value.value).split())
+                meanings[ast.unparse(field.target)] = " ".join(inspect.cleandoc(str(text.value.value)).split())
     return meanings
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,7 +14,7 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 8, 20, 34
 COLOURS = ("#2f81d7", "#d9822b", "#2a9d5c", "#a259c9", "#c0392b")
 
 
-def chart(lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_title: str, y_title: str) -> str:
+def chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], x_title: str, y_title: str) -> str:
     """Return lines by name, each of x and y, as SVG. Gaps are NaN."""
     known = {name: (np.asarray(x, float), np.asarray(y, float)) for name, (x, y) in lines.items() if len(x)}
     every = [np.concatenate([pair[axis] for pair in known.values()]) if known else np.zeros(1) for axis in (0, 1)]

@@ -17,7 +17,7 @@ LATTICE, DOT, ARROW, X_AXIS, Y_AXIS = "#37b24d", "#ffd43b", "#ff6b6b", "#ff6b6b"
 MARKED = {"saturated": "#ff922b", "hot": "#e64980"}
 
 
-class Picture(AbstractElement):
+class Picture(AbstractElement):  # type: ignore[misc]  # trame has no types
     """Element of a picture of counts, drawn by static/studio.js."""
 
     def __init__(self, **options: Any) -> None:
@@ -48,7 +48,7 @@ class Images:
             }
         )  # fmt: skip
         change = self.state.change
-        change("tab")(lambda tab, **_: tab == "images" and self._open())
+        change("tab")(lambda **_: self._open())
         change("i_camera")(lambda **_: self._list_names())
         change("i_camera", "i_name")(lambda **_: self._show())
         change("i_lattice", "i_dots", "i_pixels", "i_axes")(lambda **_: session.guarded(self._mark)())
@@ -64,11 +64,15 @@ class Images:
         if what not in ("experiment", "results", "saved"):
             return
         self.raw = None
-        if self.state.tab == "images":
-            self._open()
+        self._open()
 
     def _open(self) -> None:
-        if self.raw is None and self.session.experiment is not None and not self.state.i_busy:
+        if (
+            self.state.tab == "images"
+            and self.raw is None
+            and self.session.experiment is not None
+            and not self.state.i_busy
+        ):
             self.session.start(self._open_aside())
 
     async def _open_aside(self) -> None:
@@ -116,7 +120,9 @@ class Images:
             self.state.i_low, self.state.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
             self.state.i_marks = []
             values, counts = charts.histogram(sample)
-            self.state.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
+            self.state.i_chart = charts.chart(
+                {"": (values, np.asarray(np.log10(1 + counts)))}, "counts", "log10(pixels)"
+            )
             self.state.i_busy = "finding the microlenses"
         try:
             await session.aside(raw.calibrated, camera)

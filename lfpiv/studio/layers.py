@@ -72,7 +72,7 @@ def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.Pol
     """Return the surface on which a field has a level, with the field that colours it."""
     slim = pv.ImageData(dimensions=grid.dimensions, spacing=grid.spacing, origin=grid.origin)
     for name in (field, colour):
-        slim[name] = np.nan_to_num(grid[name], nan=np.float32(np.nanmin(grid[name], initial=0.0)))
+        slim[name] = np.nan_to_num(np.asarray(grid[name]), nan=float(np.nanmin(grid[name], initial=0.0)))
     return slim.contour([level], scalars=field)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -105,7 +106,7 @@ class Picture:
             )  # fmt: skip
         self._layer(
             "surface", look.surface and (key, look.surface, look.level, look.opacity, shade),
-            lambda: layers.surface(grid, look.surface, look.level, look.colour), **paint, opacity=look.opacity,
+            lambda: layers.surface(grid, look.surface or "", look.level, look.colour), **paint, opacity=look.opacity,
             smooth_shading=True,
         )  # fmt: skip
         self._layer(
@@ -162,7 +163,8 @@ class Picture:
         if plotter.scalar_bars:
             plotter.remove_scalar_bar(render=False)
         scale = pv.Plane(i_resolution=1, j_resolution=1)
-        scale[paint["scalars"]] = np.linspace(*paint["clim"], scale.n_points)
+        low, high = paint["clim"]
+        scale[paint["scalars"]] = np.linspace(low, high, scale.n_points)
         actor = plotter.add_mesh(
             scale, name="scale", scalars=paint["scalars"], cmap=paint["cmap"], clim=paint["clim"],
             scalar_bar_args=bar, reset_camera=False, render=False,
@@ -197,9 +199,7 @@ def script(look: Look, results: str, title: str, camera: Any, size: tuple[int, i
         Columns and rows of the picture.
     """
     body = inspect.getsource(layers).partition("from __future__ import annotations\n")[2]
-    own = (
-        inspect.getsource(inspect.getmodule(Look)).partition("\n\nBACKGROUND = {")[2].rpartition("\n\n\ndef script(")[0]
-    )
+    own = inspect.getsource(sys.modules[__name__]).partition("\n\nBACKGROUND = {")[2].rpartition("\n\n\ndef script(")[0]
     stated = [
         (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
     ]

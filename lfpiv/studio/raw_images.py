@@ -23,6 +23,8 @@ from lfpiv.results.folder import Folder
 
 HOT_SIGMA, HOT_RATIO = 12.0, 5.0
 """Least height of a hot pixel: in standard deviations of the noise, and over that of its highest neighbour."""
+MOST_LISTED = 1000
+"""Largest number of frames of particles that are listed."""
 MOST_MARKS = 3000
 """Largest number of pixels, dots or lenses that are marked."""
 ARROW_GAIN = 50.0
@@ -45,6 +47,8 @@ class RawImages:
     """Whether the cameras are calibrated."""
     grids: dict[str, np.ndarray] = field(default_factory=dict)
     """Lattice indices of a rectangle of lenses of each camera."""
+    signal: tuple[np.ndarray, np.ndarray] | None = None
+    """The last image that was seen through the pupil, and its light above the dark level."""
     views: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     """Pupil views of the last images."""
 
@@ -55,11 +59,9 @@ class RawImages:
         found = ["white", *(["dark"] if setup.dark_path else [])]
         found += [f"plane {number}" for number in range(len(e.board.planes_mm))]
         if setup.background is not None:
-            found += [f"background {frame}" for frame in dict.fromkeys(e.frames)]
-        if e.series is not None:
-            first = e.series.first
-            return found + [f"instant {number}" for number in range(first, first + e.series.instants)]
-        return found + [f"pair {pair} {frame}" for pair in e.numbers for frame in e.frames]
+            found += [f"background {frame}" for frame in e.laser_names]
+        frames = e.recording.frames[:MOST_LISTED]
+        return found + [e.recording.frame(number).label for number in frames]
 
     def read(self, camera: str, name: str) -> np.ndarray:
         """Return an image as lfpiv reads it, float32 (rows, columns) [counts]."""
@@ -72,12 +74,10 @@ class RawImages:
             image = e.board_image(camera, int(rest[0]))
         elif kind == "background":
             image = e.background_image(camera, rest[0])
-        elif kind == "instant":
-            number, step = int(rest[0]), e.series.step if e.series else 1
-            pair, frame = (number, 0) if number in e.numbers else (number - step, 1)
-            image = e.particle_image(camera, pair, e.frames[frame])
         else:
-            image = e.particle_image(camera, int(rest[0]), rest[1])
+            numbers = e.recording.frames[:MOST_LISTED]
+            frame = next(frame for frame in map(e.recording.frame, numbers) if frame.label == name)
+            image = e.frame_image(camera, frame)
         assert image is not None
         return image
 
@@ -184,8 +184,9 @@ class RawImages:
     def pupil_view(self, camera: str, image: np.ndarray, pupil_mm: tuple[float, float]) -> np.ndarray:
         """Return the scene as it is seen through a pupil point: a value for each lens; 0 where none is seen."""
         found = self.calibrated(camera)
-        level = float(np.percentile(image[::5, ::5], 20))
-        values = found.decoder.sample(image - np.float32(level), self.lens_grid(camera), pupil_mm)
+        if self.signal is None or self.signal[0] is not image:
+            self.signal = image, image - np.float32(found.decoder.background(image)[0])
+        values = found.decoder.sample(self.signal[1], self.lens_grid(camera), pupil_mm)
         return self._upright(camera, np.nan_to_num(values))
 
     def _upright(self, camera: str, values: np.ndarray) -> np.ndarray:

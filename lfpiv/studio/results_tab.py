@@ -71,7 +71,7 @@ class Results:
         self.state.change("theme", *(f"r_{name}" for name in watched.split()))(lambda **_: self.request())
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
-        self.state.change("r_playing")(lambda r_playing, **_: r_playing and session.start(self._play()))
+        self.state.change("r_playing")(self._play_or_stop)
         server = session.server
         server.trigger("r_png")(self.png)
         server.trigger("r_film")(self.film)
@@ -169,7 +169,7 @@ class Results:
     # -- pictures -----------------------------------------------------------------------------------------------------
 
     @property
-    def look(self) -> look.Look:
+    def wanted(self) -> look.Look:
         """What the state asks for."""
         s = self.state
         return look.Look(
@@ -203,7 +203,10 @@ class Results:
         """Draw what the state asks for, in both pictures if two runs are compared."""
         if self.session.results is None:
             return
-        wanted, folders = self.look, [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
+        wanted, folders = (
+            self.wanted,
+            [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])],
+        )
         for folder, picture, view in zip(folders, self.pictures, self.views, strict=False):
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
@@ -217,7 +220,8 @@ class Results:
 
     def _chart(self, wanted: look.Look, folders: list[str]) -> None:
         """Draw the histogram of the colour's field, or profiles along the axes through the planes' places."""
-        kind, lines = self.state.r_chart_kind, {}
+        kind = self.state.r_chart_kind
+        lines: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         place = () if kind == "histogram" else (self.state.r_x, self.state.r_y, self.state.r_z)
         key = (kind, place, wanted.moment, wanted.colour, wanted.hide_replaced, wanted.uncertainty, *folders)
         if key == self.charted:
@@ -248,6 +252,10 @@ class Results:
         if self.session.results is not None and self.state.r_numbers:
             self.state.r_moment = self.state.r_moments[int(r_step)]["value"]
 
+    def _play_or_stop(self, r_playing: bool, **_: Any) -> None:
+        if r_playing:
+            self.session.start(self._play())
+
     async def _play(self) -> None:
         """Show one moment after the other until it is stopped."""
         while self.state.r_playing:
@@ -269,7 +277,7 @@ class Results:
             plotter.camera_position = "xy" if VIEWS[name] == "oblique" else VIEWS[name]
             if name == "oblique":
                 camera.azimuth, camera.elevation = 25.0, 20.0
-            plotter.reset_camera(bounds=self.grid(str(self.session.results), self.look.moment).bounds, render=False)
+            plotter.reset_camera(bounds=self.grid(str(self.session.results), self.wanted.moment).bounds, render=False)
             camera.zoom(0.85)
         for picture, view in zip(self.pictures, self.views, strict=True):
             picture.plotter.renderer.ResetCameraClippingRange()
@@ -319,12 +327,12 @@ class Results:
         """Return the fields of the moment as VTK image data."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "field.vti"
-            self.grid(str(self.session.results), self.look.moment).save(path)
+            self.grid(str(self.session.results), self.wanted.moment).save(path)
             return self._attached(path.read_bytes())
 
     def csv(self) -> Any:
         """Return the vectors of the moment as a table, a row each."""
-        grid = self.grid(str(self.session.results), self.look.moment)
+        grid = self.grid(str(self.session.results), self.wanted.moment)
         names = [name for name in grid.array_names if name != "velocity"]
         text = io.StringIO()
         writer = csv.writer(text)
@@ -339,8 +347,9 @@ class Results:
         """Show the script that draws what is seen."""
         plotter = self.pictures[0].plotter
         camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
+        width, height = plotter.window_size
         self.state.r_script = look.script(
-            self.look, str(self.session.results), title_of(self.state.r_colour), camera, tuple(plotter.window_size)
+            self.wanted, str(self.session.results), title_of(self.state.r_colour), camera, (width, height)
         )
         self.state.r_script_shown = True
 

@@ -11,7 +11,7 @@ import trame_client.widgets.html as html
 from trame.widgets import vtk as vtk_widgets
 
 from lfpiv.experiment.images import read_header
-from lfpiv.studio import controls, space
+from lfpiv.studio import controls, rig_space
 from lfpiv.studio.look import BACKGROUND, INK
 from lfpiv.studio.session import Session
 
@@ -56,12 +56,12 @@ class Space:
         """Return the size of a camera's sensor, from its white image if that is there."""
         path = str(camera.get("white_image", ""))
         if path not in self.shapes and self.session.experiment is not None:
-            self.shapes[path] = space.UNKNOWN_PIXELS
+            self.shapes[path] = rig_space.UNKNOWN_PIXELS
             with contextlib.suppress(ValueError, OSError):
                 header = read_header(self.session.experiment.parent / path, "white_image")
                 if header is not None:
                     self.shapes[path] = header.shape
-        return self.shapes.get(path, space.UNKNOWN_PIXELS)
+        return self.shapes.get(path, rig_space.UNKNOWN_PIXELS)
 
     def draw(self) -> None:
         """Draw the rig as the draft states it; what is wrong in the draft is left out."""
@@ -77,26 +77,26 @@ class Space:
         values, ink = draft.values, INK[s.theme]
         volume, solids = values["volume"], values["volume"].get("solid", [])
         centre, size = (np.asarray(volume[key], float) for key in ("centre_mm", "size_mm"))
-        length = space.REACH * float(np.linalg.norm(size))
-        views = [space.view_of(camera, self._shape(camera)) for camera in values["camera"]]
+        length = rig_space.REACH * float(np.linalg.norm(size))
+        views = [rig_space.view_of(camera, self._shape(camera)) for camera in values["camera"]]
         for number, ((pupil, corners, _), camera) in enumerate(zip(views, values["camera"], strict=True)):
             colour = COLOURS[number % len(COLOURS)]
             if s.s_cameras:
-                p.add_mesh(space.pyramid(pupil, corners, length), color=colour, line_width=2, render=False)
-                p.add_mesh(space.body(pupil, length, 0.25 * length), color=colour, render=False)
+                p.add_mesh(rig_space.pyramid(pupil, corners, length), color=colour, line_width=2, render=False)
+                p.add_mesh(rig_space.body(pupil, length, 0.25 * length), color=colour, render=False)
                 place = pupil / np.linalg.norm(pupil) * min(1.2 * length, float(np.linalg.norm(pupil)))
                 p.add_point_labels([place], [camera["name"]], text_color=colour, shape=None, font_size=14, render=False)
         if s.s_board:
             for z_mm in values["board"]["planes_mm"]:
-                p.add_mesh(space.board_plane(values["board"], z_mm), color=BOARD, point_size=4, render=False)
+                p.add_mesh(rig_space.board_plane(values["board"], z_mm), color=BOARD, point_size=4, render=False)
         for solid in solids:
-            shape = space.solid_shape(solid, centre, size)
+            shape = rig_space.solid_shape(solid, centre, size)
             if shape.n_points:
                 p.add_mesh(shape, color=SOLID, opacity=0.6, render=False)
         box = np.column_stack([centre - size / 2, centre + size / 2]).ravel()
         p.add_mesh(pv.Box(box).extract_all_edges(), color=ink, line_width=2, render=False)
         facts = self._facts(volume, size)
-        counted = space.count_seen(views, centre, size)
+        counted = rig_space.count_seen(views, centre, size)
         seen = np.bincount(np.asarray(counted.cell_data["cameras"]).astype(int), minlength=len(views) + 1)
         facts += [
             f"{100 * part / seen.sum():.0f} % is seen by {n} of {len(views)} cameras"

@@ -55,12 +55,11 @@ def vectors_of(experiment: Experiment, calibration: Calibration, pair: int) -> x
     form = "profiles" if square else "pixels"  # which is built fastest
     weights = lfpiv.build_weights(calibration, guard.with_guard(experiment, layers).grid, form=form)
     darks = read_darks(experiment)
-    light = pair_light(
-        experiment, calibration.cameras, darks, pair, lambda name, at: experiment.particle_image(name, *at)
-    )
+    light = pair_light(experiment, calibration.cameras, darks, pair)
     work = Reconstructor(experiment=experiment, weights=weights, guard=layers, refinement=1.0)
     images, noise, frames = ([getattr(one, name) for one in light] for name in ("images", "noise", "frame"))
-    return measure_vectors(*work.volumes(images, noise, frames), experiment)
+    first, second = work.volumes(images, noise, frames)
+    return measure_vectors(first, second, experiment)
 
 
 def measure(request: dict[str, Any]) -> dict[str, Any]:

@@ -128,16 +128,16 @@ def test_a_view_through_the_pupil_follows_the_pixel(small_run):
 
 
 def test_cameras_see_what_they_look_at():
-    from lfpiv.studio import space
+    from lfpiv.studio import rig_space
 
     camera = {
         "focal_length_mm": 100.0, "magnification": -1.0, "f_number": 4.0, "microlens_pitch_mm": 0.1,
         "microlens_focal_length_mm": 0.8, "pixel_um": 5.5, "nominal_angle_deg": 30.0,
     }  # fmt: skip
-    pupil, corners, _ = space.view_of(camera, (2000, 1000))
+    pupil, corners, _ = rig_space.view_of(camera, (2000, 1000))
     assert np.allclose(pupil, 200 * np.array([0.5, 0, np.sqrt(0.75)]))
     assert np.ptp(corners[:, 1]) == pytest.approx(11.0)  # 2000 pixels of 5.5 um at M = -1
     points = np.array([[0, 0, 0], [0, 5.4, 0], [0, 5.6, 0], [0, 0, 300]], float)
-    assert space.inside(pupil, corners, points).tolist() == [True, True, False, False]
-    opposite = space.view_of(camera | {"nominal_direction": [0, 0, 1]}, (2000, 1000))
+    assert rig_space.inside(pupil, corners, points).tolist() == [True, True, False, False]
+    opposite = rig_space.view_of(camera | {"nominal_direction": [0, 0, 1]}, (2000, 1000))
     assert np.allclose(opposite[2], [0, 0, 1])

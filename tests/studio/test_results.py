@@ -15,6 +15,9 @@ from lfpiv.results import netcdf
 SAME_PICTURE = 1.0
 """Largest mean difference of pictures by the same calls [grey level]: fonts may be a pixel apart."""
 
+VIEW = "#tab-results .lf-view img"
+"""The picture in the tab of results."""
+
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory):
@@ -60,9 +63,9 @@ def test_the_page_shows_and_turns_results(results, browser):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(address.partition("?")[0])
         browser.get(address)
-        shown = "const i = document.querySelector('.lf-view img'); return i && i.naturalWidth > 50 ? i.src : ''"
+        shown = f"const i = document.querySelector('{VIEW}'); return i && i.naturalWidth > 50 ? i.src : ''"
         first = until(lambda: browser.execute_script(shown))
-        assert browser.find_element("class name", "lf-name").text == "run <b>"
+        assert browser.find_element("css selector", "#tab-results .lf-name").text == "run <b>"
         browser.find_element("id", "r-on-x").send_keys(" ")
         second = until(lambda: (now := browser.execute_script(shown)) != first and now)
         browser.find_element("id", "r-turn-left").click()

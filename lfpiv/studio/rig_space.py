@@ -63,7 +63,7 @@ def direction_of(camera: Mapping[str, Any]) -> np.ndarray:
     else:
         angle = np.radians(float(camera.get("nominal_angle_deg", 0.0)))
         vector = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    return vector / np.linalg.norm(vector)
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def pyramid(pupil: np.ndarray, corners: np.ndarray, length: float) -> pv.PolyData:
@@ -100,7 +100,8 @@ def count_seen(views: list[View], centre: np.ndarray, size: np.ndarray) -> pv.Im
     counts = np.maximum(2, np.round(SEEN_VOXELS * size / size.max())).astype(int)
     grid = pv.ImageData(dimensions=counts + 1, spacing=size / counts, origin=centre - size / 2)
     points = np.asarray(grid.cell_centers().points, float)
-    grid.cell_data["cameras"] = sum(inside(*view[:2], points).astype(np.float32) for view in views)
+    seen = [inside(pupil, corners, points) for pupil, corners, _ in views]
+    grid.cell_data["cameras"] = np.sum(seen, axis=0).astype(np.float32)
     return grid
 
 
