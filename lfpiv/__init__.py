@@ -26,7 +26,9 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.geometry.optics import LensLattice as LensLattice
     from lfpiv.geometry.optics import Optics as Optics
     from lfpiv.geometry.resampling import volume_on as volume_on
+    from lfpiv.joint.field import joint_field as joint_field
     from lfpiv.joint.pair import reconstruct_pair as reconstruct_pair
+    from lfpiv.joint.vectors import joint_vectors as joint_vectors
     from lfpiv.lightfield.lens_array import LensArray as LensArray
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.planning.campaign import plan as plan
@@ -34,6 +36,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.report import write_report as write_report
     from lfpiv.results.export import export_results as export_results
     from lfpiv.results.particles import open_particles as open_particles
+    from lfpiv.results.reader import open_field as open_field
     from lfpiv.results.reader import open_results as open_results
     from lfpiv.results.track_files import open_tracks as open_tracks
     from lfpiv.runs.measurement import Rig as Rig
@@ -62,11 +65,14 @@ _MODULES = {
     "export_results": "lfpiv.results.export",
     "find_lens_array": "lfpiv.lightfield.lens_array",
     "find_particles": "lfpiv.tracking.finding",
+    "joint_field": "lfpiv.joint.field",
+    "joint_vectors": "lfpiv.joint.vectors",
     "link_particles": "lfpiv.tracking.linking",
     "load_calibration": "lfpiv.calibration.camera",
     "measure_damping": "lfpiv.damping.bootstrap",
     "measure_pair": "lfpiv.runs.measurement",
     "open_experiment": "lfpiv.experiment.opening",
+    "open_field": "lfpiv.results.reader",
     "open_results": "lfpiv.results.reader",
     "open_particles": "lfpiv.results.particles",
     "open_tracks": "lfpiv.results.track_files",

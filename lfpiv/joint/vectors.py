@@ -83,7 +83,10 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     if about.get("estimate") == Estimate.ALONE.value:
         del about["estimate"]
     if not is_joint(*volumes):
-        return correlate(*volumes, dt_s=dt_s, **correlation).assign_attrs(about)
+        vectors = correlate(*volumes, dt_s=dt_s, **correlation).assign_attrs(about)
+        if "estimate" in about:  # a fit that was not started: its file has the variables of the other pairs
+            vectors["joint"] = _flags(np.zeros(vectors["valid"].shape, bool), vectors)
+        return vectors
     alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
     vectors = correlate(*alone, dt_s=dt_s, **correlation)
     lossy = LOSSY if about.get("lossy") else 1.0
@@ -168,7 +171,12 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, factor: float = 1.0) -> xr.
         name: vectors[name].copy(data=np.where(joint, deformed, vectors[name].values).astype(np.float32))
         for name, deformed in (("correlation", evidence.correlation), ("peak_ratio", evidence.peak_ratio))
     }
-    about = {"long_name": "mean of the fitted displacement; false: contradicted, and measured by correlation"}
-    found["joint"] = xr.DataArray(joint, vectors["valid"].coords, vectors["valid"].dims, attrs=about)
+    found["joint"] = _flags(joint, vectors)
     share = float(joint[valid].mean()) if valid.any() else 0.0
     return merged.assign(found).assign_attrs(joint_fraction=share)
+
+
+def _flags(joint: np.ndarray, vectors: xr.Dataset) -> xr.DataArray:
+    """Return the variable that says which vectors come from the fit."""
+    about = {"long_name": "mean of the fitted displacement; false: contradicted, and measured by correlation"}
+    return xr.DataArray(joint, vectors["valid"].coords, vectors["valid"].dims, attrs=about)

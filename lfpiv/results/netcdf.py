@@ -34,6 +34,9 @@ ROUNDING = 1e-5
 RECONSTRUCTION = "reconstruction"
 """NetCDF group in the file of a pair's vectors: projections, profiles and residuals of its two volumes."""
 
+FIELD = "field"
+"""NetCDF group in the file of a pair's vectors: the displacement field of its joint fit."""
+
 _GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # in the file z, y, x are the axes of the vectors
 
 OF_IMAGES = ("structure", "camera_gain", "light_outside")
@@ -177,7 +180,12 @@ def check_volume(volume: xr.DataArray) -> None:
 
 
 def write_vectors(
-    vectors: xr.Dataset, path: Path, *, attributes: Mapping[str, Any], reconstruction: xr.Dataset | None = None
+    vectors: xr.Dataset,
+    path: Path,
+    *,
+    attributes: Mapping[str, Any],
+    reconstruction: xr.Dataset | None = None,
+    field: xr.Dataset | None = None,
 ) -> None:
     """Write the vectors of one pair as NetCDF4, atomically.
 
@@ -191,6 +199,8 @@ def write_vectors(
         Added to the dataset's attributes: settings, their hash, seconds.
     reconstruction : Dataset, optional
         From `build_reconstruction`; stored as the group "reconstruction".
+    field : Dataset, optional
+        From `lfpiv.joint.field.joint_field`; stored as the group "field".
 
     Raises
     ------
@@ -200,8 +210,9 @@ def write_vectors(
     check_vectors(vectors)
     path.parent.mkdir(parents=True, exist_ok=True)
     groups = {"": datasets.packed(vectors, {**attributes, "versions": versions(), datasets.FILE: path.name})}
-    if reconstruction is not None:
-        groups[RECONSTRUCTION] = datasets.packed(reconstruction.rename(_GROUP_AXES), {}, root=False)
+    for name, group in ((RECONSTRUCTION, reconstruction), (FIELD, field)):
+        if group is not None:
+            groups[name] = datasets.packed(group.rename(_GROUP_AXES), {}, root=False)
     datasets.write_groups(groups, path)
 
 
@@ -223,8 +234,17 @@ def read_vectors(path: Path) -> xr.Dataset:
 
 def read_reconstruction(path: Path) -> xr.Dataset | None:
     """Read the condensed volumes in the file of a pair's vectors; None if the file has none."""
+    return _read_beside(path, RECONSTRUCTION)
+
+
+def read_field(path: Path) -> xr.Dataset | None:
+    """Read the field of a joint fit in the file of a pair's vectors; None if the file has none."""
+    return _read_beside(path, FIELD)
+
+
+def _read_beside(path: Path, group: str) -> xr.Dataset | None:
     try:
-        stored = datasets.read_group(path, RECONSTRUCTION)
+        stored = datasets.read_group(path, group)
     except InputError:
         return None
     return stored.rename({name: axis for axis, name in _GROUP_AXES.items() if name in stored.dims})

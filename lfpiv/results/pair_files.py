@@ -238,11 +238,17 @@ class PairFiles:
                     aside = retire(path)
                 yield path, aside
 
-    def write_vectors(self, vectors: xr.Dataset, condensed: xr.Dataset, attributes: Mapping[str, Any]) -> None:
-        """Write the vectors and the condensed volumes into one file, atomically."""
+    def write_vectors(
+        self,
+        vectors: xr.Dataset,
+        condensed: xr.Dataset,
+        attributes: Mapping[str, Any],
+        field: xr.Dataset | None = None,
+    ) -> None:
+        """Write the vectors, the condensed volumes and the field of a joint fit into one file, atomically."""
         marks = {**self.stamp.attributes, **self.origin, **attributes}
         with writing(self.vectors):
-            netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed)
+            netcdf.write_vectors(vectors, self.vectors, attributes=marks, reconstruction=condensed, field=field)
             self.vectors.with_suffix(RETIRED).unlink(missing_ok=True)
 
     def write_particles(self, table: xr.Dataset) -> None:

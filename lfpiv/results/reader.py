@@ -11,7 +11,9 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from lfpiv.errors import InputError
 from lfpiv.results import stores
+from lfpiv.results.netcdf import read_field
 from lfpiv.results.stacked_files import StackedFiles
 
 CHUNK_BYTES = 8 << 20
@@ -79,6 +81,36 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
     if importlib.util.find_spec("dask") is None:
         return results
     return results.chunk({files.dimension: min(max(1, CHUNK_BYTES // files.first["u"].nbytes), CHUNK_PAIRS)})
+
+
+def open_field(folder: str | Path, pair: int) -> xr.Dataset:
+    """Open the displacement field of a pair's joint fit, which is finer than its vectors.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Output folder of `lfpiv run`, with ``smart.estimate = "joint"``.
+    pair : int
+        Number of the pair.
+
+    Returns
+    -------
+    Dataset
+        As `joint_field` returns it.
+
+    Raises
+    ------
+    InputError
+        If the pair has no vectors, or no field: it was not fitted jointly.
+    """
+    path = StackedFiles(Path(folder), (pair, pair + 1)).path(0)
+    field = read_field(path)
+    if field is None:
+        raise InputError(
+            f'{path}: expected the field of a joint fit, found none. Set smart.estimate = "joint" and run again; if it '
+            "is set, the report says why this pair was not fitted."
+        )
+    return field
 
 
 class _Stack(BackendArray):

@@ -244,7 +244,7 @@ def _signature(file: h5py.File, path: Path) -> Signature:
     attributes = {key: file.attrs[key] for key in COMMON if key in file.attrs}
     depends_on = read_object(file.attrs.get("depends_on", "{}"))
     axes = {axis: file[axis][...] for axis in AXES}
-    names = set(file) - {*AXES, netcdf.RECONSTRUCTION}
+    names = set(file) - {*AXES, netcdf.RECONSTRUCTION, netcdf.FIELD}
     shared = {key: value for key, value in depends_on.items() if key not in provenance.OF_PAIR}
     attributes |= {key: json.dumps(value, sort_keys=True) for key, value in shared.items()}
     return Signature(path=path, attributes=attributes, axes=axes, names=names)

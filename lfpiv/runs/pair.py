@@ -24,6 +24,8 @@ from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
 from lfpiv.geometry.grid import Layers
+from lfpiv.joint.field import joint_field
+from lfpiv.joint.vectors import is_joint
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
@@ -327,7 +329,8 @@ class PairWork:
             "correlation": self.experiment.correlation.model_dump(),
             "figures": figures.to_json(),
         }
-        return figures, partial(files.write_vectors, vectors, condensed, attributes)
+        field = joint_field(volumes.volumes, vectors) if is_joint(*volumes.volumes) else None
+        return figures, partial(files.write_vectors, vectors, condensed, attributes, field)
 
     def _correlate(self, files: PairFiles, volumes: PairVolumes, progress: StepProgress) -> None:
         experiment = self.experiment

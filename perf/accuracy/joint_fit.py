@@ -14,14 +14,17 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from reconstruction_cases import ANGLES_DEG, Case, make_rig, record, true_field, true_volume
+import xarray as xr
+from reconstruction_cases import ANGLES_DEG, Case, Recorded, make_rig, record, true_field, true_volume
 from reconstruction_ways import guard_layers, particle_size, weights_of
 
 from lfpiv import metrics
 from lfpiv.geometry.grid import AXES
+from lfpiv.joint.fit import JointFit
 from lfpiv.joint.pair import PairSolver
 from lfpiv.joint.vectors import joint_vectors
 from lfpiv.reconstruction.refinement import needed_refinement
@@ -40,8 +43,20 @@ def case_of(text: str) -> Case:
     return Case(flow=flow, ppm=float(ppm), seed=int(seed), angles_deg=angles, condition=condition, scale="flat", **blob)
 
 
-def measured(case: Case, estimate: str) -> str:
-    """Measure a case, and return the row of its figures."""
+@dataclass(frozen=True)
+class Fitted:
+    """Volumes and vectors of a case."""
+
+    recorded: Recorded
+    volumes: list[xr.DataArray]
+    vectors: xr.Dataset
+    fit: JointFit | None
+    seconds: float
+    """CPU time of the solver and the vectors [s]."""
+
+
+def fitted(case: Case, estimate: str) -> Fitted:
+    """Measure a case."""
     rig, recorded = make_rig(case.scale, case.angles_deg), record(case, FOLDER)
     size = particle_size(rig, recorded)
     factor = needed_refinement(size)
@@ -54,7 +69,13 @@ def measured(case: Case, estimate: str) -> str:
     result = solver.solve(light, noise)
     volumes = [volume.drop_vars("views", errors="ignore") for volume in result.to_dataarrays(rig.grid)]
     vectors = joint_vectors(volumes, dt_s=1.0, **correlation)
-    seconds = time.process_time() - start
+    return Fitted(recorded, volumes, vectors, result.fit, time.process_time() - start)
+
+
+def measured(case: Case, estimate: str) -> str:
+    """Measure a case, and return the row of its figures."""
+    result = fitted(case, estimate)
+    vectors, volumes = result.vectors, result.volumes
     edge = json.loads(vectors.attrs["settings"])["windows"][-1]
     exact = true_field(case, [vectors[axis].values for axis in AXES], edge)
     found, stated = (
@@ -67,14 +88,14 @@ def measured(case: Case, estimate: str) -> str:
     slopes = (spread * found).sum((0, 1, 2)) / (spread**2).sum((0, 1, 2))
     held = (np.abs(error[valid]) < 2 * stated[valid]).mean()
     quality = np.mean(
-        [metrics.reconstruction_quality(one, true_volume(case, recorded, k)) for k, one in enumerate(volumes)]
+        [metrics.reconstruction_quality(one, true_volume(case, result.recorded, k)) for k, one in enumerate(volumes)]
     )
     rms = np.sqrt((error**2).mean((0, 1, 2)))
     fit = "" if result.fit is None else f" ({result.fit.rounds} rounds, {result.fit.misfit_ratio:.2f})"
     return (
         f"{length.mean():.3f} / {inner.mean():.3f} | {' '.join(f'{one:.3f}' for one in rms)} | "
         f"{' '.join(f'{one:.2f}' for one in slopes)} | {100 * held:.0f} % | {length[valid].max():.2f} | "
-        f"{100 * valid.mean():.0f} % | {quality:.3f} | {seconds:.1f}{fit}"
+        f"{100 * valid.mean():.0f} % | {quality:.3f} | {result.seconds:.1f}{fit}"
     )
 
 

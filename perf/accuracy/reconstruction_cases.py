@@ -45,7 +45,11 @@ ARRAYS_MM = ((0.031, -0.022), (-0.02, 0.04), (0.01, 0.013), (-0.037, -0.009))
 RAYS = 16_384
 """Rays per particle."""
 WHITE_RAYS, WHITE_COUNTS = 256, 3000.0
-FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent", "abc")
+WAVE = "wave"
+"""Start of the name of a transverse wave along x, followed by its length [voxel]."""
+WAVE_STRAIN = 0.25
+"""Largest strain of a wave, whatever its length."""
+FLOWS = ("ring", "swirl", "shear", "uniform", "turbulent", "abc", f"{WAVE}16")
 ABC_MM = 0.092
 """Amplitude of the flow of Arnold, Beltrami and Childress, whose components are sheared along two axes each."""
 TRACERS, TRACERS_MM = "dns", 8.0
@@ -202,6 +206,8 @@ def make_flow(case: Case):
         return TurbulentFlow(still, law.realisation(seed=[case.seed, 41]))
     if case.flow == "abc":
         return Abc(ABC_MM * case.speed, SIZE_MM[case.scale][0])
+    if case.flow.startswith(WAVE):
+        return Wave(float(case.flow.removeprefix(WAVE)) * VOXEL_MM)
     raise ValueError(f"flow: expected one of {', '.join(FLOWS)}, got {case.flow!r}.")
 
 
@@ -216,6 +222,18 @@ class Abc:
         x, y, z = np.asarray(points_mm, float).T * (2 * np.pi / self.wave_mm)
         sums = (np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x))
         return self.amplitude_mm * np.stack(sums, axis=1)
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Displacement along y and z that oscillates along x."""
+
+    wave_mm: float
+
+    def __call__(self, points_mm: np.ndarray) -> np.ndarray:
+        phase = np.asarray(points_mm, float)[:, 0] * (2 * np.pi / self.wave_mm)
+        amplitude = WAVE_STRAIN * self.wave_mm / (2 * np.pi)
+        return amplitude * np.stack([np.zeros_like(phase), np.sin(phase), np.cos(phase)], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,6 +8,7 @@ from support.ideal_rig import optics, two_cameras
 
 import lfpiv
 from lfpiv import metrics
+from lfpiv.joint.field import WIDENED
 from lfpiv.joint.pair import MOVED, UNSHARED, Estimate, PairSolver
 from lfpiv.joint.vectors import joint_vectors
 from lfpiv.simulation.flows import Swirl, window_mean
@@ -72,6 +73,21 @@ def test_both_frames_fitted_together_measure_better(pair, fitted):
     assert seen == sorted(seen) and seen[-1] == 1.0
 
 
+def test_the_field_is_finer_than_its_vectors(pair, fitted):
+    """Where vectors are near, errors at single places are as large as stated, and the divergence is small."""
+    vectors = joint_vectors(fitted[0], dt_s=1e-3, **CORRELATION)
+    field = lfpiv.joint_field(fitted[0], vectors)
+    z, y, x = np.meshgrid(*(field[axis].values for axis in "zyx"), indexing="ij")
+    exact = pair[0](np.stack([x, y, z], -1).reshape(-1, 3)).reshape(*x.shape, 3) / GRID.voxel_mm
+    found, stated = (
+        np.stack([field[f"{name}_{axis}"].values for axis in "xyz"], -1) for name in ("displacement", "uncertainty")
+    )
+    error = np.abs(found - exact)[field.valid.values]
+    assert np.linalg.norm(error, axis=-1).mean() < WIDENED * errors(vectors, pair[0]).mean()
+    assert (error < 2 * stated[field.valid.values]).mean() > 0.9
+    assert float(np.abs(field.divergence).mean()) < 0.5 * float(np.abs(field.vorticity_y).mean())
+
+
 def test_a_displacement_that_the_frames_contradict_is_not_taken(fitted):
     volumes, _ = fitted
     first = volumes[0]
@@ -94,7 +110,8 @@ def test_frames_without_common_particles_start_no_fit(weights, pair):
     strangers = [pair[1][0], images_of(weights, np.random.default_rng(9).uniform(-0.9, 0.9, (240, 3)), 5)]
     volumes = lfpiv.reconstruct_pair(weights, strangers, estimate="joint", iterations=4)
     assert volumes[0].attrs["estimate"] == Estimate.NOT_STARTED.value
-    assert joint_vectors(volumes, **CORRELATION).attrs["estimate"] == Estimate.NOT_STARTED.value
+    vectors = joint_vectors(volumes, **CORRELATION)
+    assert vectors.attrs["estimate"] == Estimate.NOT_STARTED.value and not vectors.joint.any()
 
 
 def test_wrong_arguments_are_named(weights, pair):

@@ -1,0 +1,79 @@
+"""Response of the vectors to waves of each length: the smallest structure that the correlation and the joint fit show.
+
+    python perf/accuracy/resolution.py --waves 8 12 16 20 24 32 --seeds 1 2
+
+A transverse wave along x moves particles along y, across the view, and along z, in depth. The response is the slope of
+the measured on the true displacement at the centres of the windows, or at the voxels for the field of the joint fit,
+away from the faces. "true" is the correlation of the true volumes: what the windows alone take away.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import xarray as xr
+from joint_fit import case_of, fitted
+from reconstruction_cases import make_flow, true_volume
+
+from lfpiv.geometry.grid import AXES
+from lfpiv.joint.pair import MOVED
+from lfpiv.settings.processing import Correlation
+from lfpiv.velocity.cross_correlation import correlate
+from lfpiv.velocity.settings import cut_windows
+
+FACE_MM = 0.6
+"""Distance from the faces that is left out: half of the last window."""
+
+
+def response(case, axes_mm, displacement_voxel: np.ndarray, voxel_mm: float) -> np.ndarray:
+    """Return the slopes along y and z of displacements (z, y, x, 3), in order x, y, z, on axes (z, y, x)."""
+    z, y, x = np.meshgrid(*axes_mm, indexing="ij")
+    exact = make_flow(case)(np.stack([x, y, z], -1).reshape(-1, 3)).reshape(*x.shape, 3) / voxel_mm
+    inner = np.ones(x.shape, bool)
+    for axis, values in enumerate(axes_mm):
+        far = (
+            (values >= values[0] + FACE_MM) & (values <= values[-1] - FACE_MM) if len(values) > 12 else values == values
+        )
+        inner &= np.expand_dims(far, tuple(k for k in range(3) if k != axis))
+    inner &= np.isfinite(displacement_voxel).all(-1)
+    exact, found = exact[inner], displacement_voxel[inner]
+    return ((exact * found).sum(0) / (exact**2).sum(0).clip(1e-12))[1:]
+
+
+def of_vectors(case, vectors: xr.Dataset) -> np.ndarray:
+    """Return the response of vectors."""
+    found = np.stack([vectors[f"displacement_{axis}"].values for axis in "xyz"], -1)
+    return response(case, [vectors[axis].values for axis in AXES], found, float(vectors.attrs["voxel_mm"][0]))
+
+
+def responses(name: str) -> np.ndarray:
+    """Return the responses along y and z of one case: correlation, true volumes, joint vectors, joint field."""
+    case = case_of(name)
+    alone, joint = fitted(case, "correlation"), fitted(case, "joint")
+    windows = cut_windows(case.windows, alone.volumes[0].shape)
+    true = [true_volume(case, alone.recorded, frame) for frame in (0, 1)]
+    ideal = correlate(*true, **Correlation().model_dump() | {"windows": windows})
+    first = joint.volumes[0]
+    moved = np.stack([first[MOVED[axis]].values for axis in "xyz"], -1)
+    axes = [first[axis].values for axis in AXES]
+    field = response(case, axes, moved, float(axes[2][1] - axes[2][0]))
+    return np.stack([of_vectors(case, alone.vectors), of_vectors(case, ideal), of_vectors(case, joint.vectors), field])
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--waves", nargs="+", type=int, default=[8, 10, 12, 16, 20, 24, 32])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--ppm", type=float, default=0.5)
+    arguments = parser.parse_args()
+    print(
+        "| wave [voxel] | correlation y, z | true y, z | joint vectors y, z | joint field y, z |\n|---|---|---|---|---|"
+    )
+    for wave in arguments.waves:
+        found = np.array([responses(f"wave{wave}:{arguments.ppm}:{seed}:2") for seed in arguments.seeds])
+        mean, spread = found.mean(0), found.std(0)
+        cells = [
+            " ".join(f"{m:.2f} ± {s:.2f}" for m, s in zip(*row, strict=True)) for row in zip(mean, spread, strict=True)
+        ]
+        print(f"| {wave} | {' | '.join(cells)} |", flush=True)
