@@ -444,14 +444,6 @@ def test_volumes_made_of_gaussians_are_smoothed_less_before_they_are_correlated(
         assert np.allclose(less[name], same[name], atol=TOLERANCE_F32)
 
 
-def test_truth_is_a_fixed_point():
-    weights = random_system(4)
-    truth = np.random.default_rng(4).uniform(0.5, 2, weights.grid.shape).astype(np.float32)
-    volume = plain_steps.reconstruct(weights, weights(truth), iterations=20, first=truth)
-    assert np.abs(volume.values / truth - 1).max() <= TOLERANCE_F32
-    assert volume.residual[-1] <= TOLERANCE_F32
-
-
 def test_the_floor_is_the_noise_of_dark_pixels_by_default():
     weights, _, images = noisy_blobs(120)
     measured = plain_steps.reconstruct(weights, images, 2, floor_share=0.0)
@@ -499,20 +491,6 @@ def test_dark_pixels_without_a_floor_do_not_end_it():
     volume = plain_steps.reconstruct(weights, images, 40, floor=0.0, floor_share=0.0)
     assert np.isfinite(volume.misfit).all() and volume.misfit[-1] < 0.5 * volume.misfit[0]
     assert np.isfinite(volume.values).all() and (volume.values > 0).any()
-
-
-def test_particles_come_back_in_their_places():
-    grid = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.4, 1.2), voxel_mm=0.1)
-    weights = lfpiv.build_weights(two_cameras(), grid)
-    truth = np.zeros(grid.shape, np.float32)
-    places = [(3, 4, 5), (8, 9, 10), (5, 10, 3)]
-    for place in places:
-        truth[place] = 1000.0
-    images = weights(truth)
-    volume = plain_steps.reconstruct(weights, images, iterations=20, floor=1e-3, floor_share=0.0)
-    brightest = np.argsort(volume.values.ravel())[::-1]
-    found = np.array(np.unravel_index(brightest[:3], grid.shape)).T
-    assert sorted(map(tuple, found)) == sorted(places)
 
 
 def test_light_outside_the_volume_and_dead_pixels_do_not_break_it():
