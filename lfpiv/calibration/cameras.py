@@ -21,6 +21,7 @@ from lfpiv.calibration import checks, contradictions, scales
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import KINDS, BoardErrors
+from lfpiv.calibration.board.pupil_zones import mean_size
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -217,6 +218,7 @@ def _calibrate_camera(
     quality = _quality(sensor, dots, mapping, nominal, int(rejected.sum()))
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
+    checks.check_pupil_zones(setup, dots, sensor.lattice.pitch_mm)
     log.info(
         "camera %s: calibrated with %d of %d dots; at dots that were held back, rays are off by %.2g microlens pitches",
         setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
@@ -292,7 +294,7 @@ def _quality(
         **vars(sensor.quality),
         turn_from_nominal_deg=nominal.turn_deg,
         magnification=nominal.magnification,
-        sigma_nor_test=training.sigma_nor,
+        sigma_nor_test=math.hypot(training.sigma_nor, mean_size(dots.left_over_mm) / sensor.lattice.pitch_mm),
         sigma_nor_stated=mapping.sigma_nor_stated,
         dots_found=int(dots.found.sum()),
         dots_expected=int(dots.expected.sum()),

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from lfpiv.calibration.board.board import few_pixels
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
+from lfpiv.calibration.board.pupil_zones import worst
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
@@ -293,3 +294,11 @@ def check_mapping(
         doubt(Code.FEW_LABELS, dots=training_dots, values=values, parameters=parameters)
     if not quality.sigma_nor_test <= SIGMA_NOR_PITCH[estimator]:
         doubt(Code.MAPPING_ERROR, sigma_nor=quality.sigma_nor_test, usual=SIGMA_NOR_PITCH[estimator])
+
+
+def check_pupil_zones(setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> None:
+    """Warn where the light of the dots lies beside their labels in a zone of the pupil: the lens bends rays further."""
+    off_mm, (u, v) = worst(dots.left_over_mm)
+    if off_mm > 0:
+        figures = {"off_pitch": off_mm / pitch_mm, "u": u, "v": v, "f_number": setup.optics.f_number}
+        warn(log, Warning(code=Code.PUPIL_ZONE, subject=setup.name, figures=figures))

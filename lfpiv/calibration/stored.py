@@ -42,6 +42,7 @@ _LABELS = {
     "chief_mm": ("d", 2),
     "slope": ("d", 2, 2),
     "reduced_chi2": ("d",),
+    "left_over_mm": ("part", "zone", 2),
     "points_mm": ("n", 3),
     "found": ("plane",),
     "expected": ("plane",),

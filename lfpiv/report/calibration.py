@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.patches import PathPatch, Polygon, Rectangle
 
+from lfpiv.calibration.board.dot_model import zone_middles
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
@@ -224,6 +225,9 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
             ["held-out labels", "[pitch]"], rows, caption=f"Errors of held-out labels of {camera.name}"
         )
         numbers = table + numbers
+    left_over = np.zeros((0, 0, 2)) if camera.dots is None else camera.dots.left_over_mm
+    if left_over.any():
+        shown.append(pupil_residual(left_over.mean(0) / camera.lattice.pitch_mm))
     rms = float(np.sqrt((found.error**2).mean()))
     caption = (
         f"Mapping of {camera.name} against its dots, over the field and over the depth: for each dot the mean over its "
@@ -232,6 +236,20 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
         "Held-out labels are single rays of dots that the training did not see."
     )
     return markup.figure(shown, caption, numbers)
+
+
+def pupil_residual(displacement: np.ndarray) -> str:
+    """Draw how far the light of the dots lies beside the fitted rays, by zone of the pupil (zone, 2) [pitch]."""
+    figure, (axes,) = new_panel(3.1)
+    middle, size = zone_middles(), np.linalg.norm(displacement, axis=1)
+    shown = axes.scatter(*middle.T, c=size, s=60, cmap="viridis", vmin=0)
+    step = displacement * (0.2 / max(float(size.max()), 1e-12))
+    axes.add_patch(PathPatch(arrows(middle, step, 0.07), edgecolor=INK, fill=False, lw=1.1))
+    axes.set(xlim=(-1.2, 1.2), ylim=(-1.2, 1.2), aspect="equal")
+    title = f"light beside the fitted rays, up to {size.max():.3f} pitch"
+    style(axes, title=title, xlabel="u [pupil radii]", ylabel="v [pupil radii]")
+    colour_bar(figure, shown, axes, "[pitch]")
+    return to_svg(figure, f"Map over the pupil: {title}.")
 
 
 def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:

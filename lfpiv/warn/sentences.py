@@ -44,6 +44,7 @@ class Code(enum.Enum):
     SCALES = "scales"
     FEW_LABELS = "few_labels"
     MAPPING_ERROR = "mapping_error"
+    PUPIL_ZONE = "pupil_zone"
     # cameras and volume
     OUTSIDE_CALIBRATION = "outside_calibration"
     OUTSIDE_SIGHT = "outside_sight"
@@ -200,6 +201,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.MAPPING_ERROR: (
         "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use "
         "more dots or planes, and check the board's images."
+    ),
+    Code.PUPIL_ZONE: (
+        "the dots' light lies up to {off_pitch:.3f} pitch beside the fitted rays, most at ({u:.1f}, {v:.1f}) pupil "
+        "radii (u, v): the lens bends rays in a way that the calibration does not follow. The stated error has it; "
+        "an f-number above {f_number:g} lowers it."
     ),
     Code.OUTSIDE_CALIBRATION: (
         "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to "

@@ -12,7 +12,14 @@ from lfpiv.calibration.board import label
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.detect import on_lattice, search_radius_mm
 from lfpiv.calibration.board.dot_fit import DotFit, converged
-from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
+from lfpiv.calibration.board.dot_model import (
+    BEND_ORDERS,
+    TERMS,
+    LensIntegral,
+    SharedParameters,
+    bends,
+    ray_terms,
+)
 from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, follow_bend
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
@@ -40,6 +47,7 @@ SHARE_ERROR = 0.1  # a tenth hardly changes the weights
 GRADIENT_ERROR = 0.03  # differences over 2 % of a lens smooth the gradient's kinks
 FAINT = 0.25  # largest share of a dot that a pixel of an overexposed one sees
 FAINT_NOISE = 0.4  # faint pixels add the read-out noise: 2 counts, where a fifth of a dot has some 30 of shot noise
+BENDS = bends(BEND_ORDERS[0])
 FALSE_BENDS = 0.03  # 0.001 for many dots of equal information; more for five unequal ones
 F_ERROR = 5 * 0.5 / np.sqrt(20_000)  # five standard deviations of a count of 20,000 rays
 
@@ -333,7 +341,9 @@ def test_dots_outside_the_field_are_missing_and_overlapping_ones_are_not_biased(
 def slope_at(theta, pupil):
     """Return the derivative of the ray model over pupil points in radii, by differences, shape (n, 2, 2)."""
     steps = 1e-5 * np.eye(2)
-    ahead, behind = ([ray_terms(pupil + sign * step, 1.0) @ theta for step in steps] for sign in (1, -1))
+    ahead, behind = (
+        [ray_terms(pupil + sign * step, 1.0, BEND_ORDERS[0]) @ theta for step in steps] for sign in (1, -1)
+    )
     return np.stack([(a - b) / 2e-5 for a, b in zip(ahead, behind, strict=True)], axis=-1)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, LensTable, ray_terms, slope_of
+from lfpiv.calibration.board.dot_model import TERMS, ZONES, LensIntegral, LensTable, slope_of, zone_of
 from lfpiv.calibration.board.dots import ExpectedDot
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.lightfield.decoder import LightFieldDecoder, disc_fraction
@@ -93,11 +93,16 @@ class DotFit:
     """Covariance of theta.T.ravel() [mm^2], prior included, shape (12, 12)."""
     pull: np.ndarray
     """Slope of the fit's log-likelihood over the shared parameters, with the dot's own fitted along: log(diameter),
-    blur^2 [pixel^2] and bend.T.ravel() [mm], shape (2 + 2 BENDS,)."""
+    blur^2 [pixel^2] and bend.T.ravel() [mm], shape (2 + 2 bends,)."""
     pull_information: np.ndarray
-    """Inverse covariance of the shared parameters from this dot, shape (2 + 2 BENDS, 2 + 2 BENDS)."""
+    """Inverse covariance of the shared parameters from this dot, shape (2 + 2 bends, 2 + 2 bends)."""
     following: np.ndarray
-    """Derivative of theta.T.ravel() over the shared parameters, shape (12, 2 + 2 BENDS)."""
+    """Derivative of theta.T.ravel() over the shared parameters, shape (12, 2 + 2 bends)."""
+    zone_pull: np.ndarray
+    """Slope of the fit's log-likelihood over displacements (s, then t) of the rays in the zones of the pupil, with the
+    dot's own unknowns fitted along [1/mm], shape (2 ZONES,), float32."""
+    zone_information: np.ndarray
+    """Inverse covariance of these displacements from this dot, shape (2 ZONES, 2 ZONES), float32."""
     base: float
     """Light of the board beside the dot, 1 as bright as the white image."""
     amplitude: float
@@ -149,7 +154,7 @@ def _pixels_around(model: LensIntegral, pixels: BoardPixels, dot: ExpectedDot, m
     high = np.maximum(np.ceil(corners[1]) + 1, low).astype(int)
     row, column = np.nonzero(pixels.usable[low[1] : high[1], low[0] : high[0]])
     at = (row + low[1], column + low[0])
-    terms = ray_terms(decoder.pupil_mm[at], optics.pupil_radius_mm)
+    terms = model.pixel_terms(decoder.pupil_mm[at])
     offset, _ = model.offset_mm(terms, dot.theta, decoder.lattice.centres_mm(decoder.lens_index[at]))
     take = (np.abs(offset) < support + margin_mm).all(1)
     inverse = np.linalg.inv(np.eye(2) - slope_of(dot.theta, optics.pupil_radius_mm))
@@ -186,7 +191,7 @@ class _Problem:
     response: np.ndarray  # counts of the white image above the dark level, (n,)
     pupil_mm: np.ndarray  # pupil points seen through the lens centres, (n, 2)
     lens_mm: np.ndarray  # lens centres (s, t), (n, 2)
-    terms: np.ndarray  # `ray_terms`, (n, TERMS + BENDS)
+    terms: np.ndarray  # `pixel_terms`, (n, TERMS + bends)
 
     @classmethod
     def of_dot(
@@ -213,7 +218,7 @@ class _Problem:
             response=pixels.response[at].astype(float),
             pupil_mm=pupil,
             lens_mm=decoder.lattice.centres_mm(decoder.lens_index[at]),
-            terms=ray_terms(pupil, model.optics.pupil_radius_mm),
+            terms=model.pixel_terms(pupil),
         )
 
     def table(self, theta: np.ndarray) -> LensTable:
@@ -278,6 +283,25 @@ class _Problem:
         gradient[:_RAYS] -= self.dot.information @ self._miss(state)
         return normal, gradient
 
+    def zone_equations(self, state: _State, weight: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the right-hand side and the matrix of the zones' displacements; `inverse` eliminates the dot's own."""
+        zone = zone_of(self.pupil_mm / self.model.optics.pupil_radius_mm)
+        strength = state.linear[1] * self.response
+        along = [(strength * along)[:, None] for along in state.along]
+        own = self.terms[:, :TERMS]
+        columns = [along[0] * own, along[1] * own, self.response[:, None], (self.response * state.share)[:, None]]
+        jacobian = np.hstack(columns)
+        size = np.abs(state.misfit) * np.sqrt(weight)
+        weight = weight * _ROBUST_SIGMA / np.maximum(size, _ROBUST_SIGMA)
+        inside = zone[:, None] == np.arange(ZONES)
+        zones = np.hstack([along[0] * inside, along[1] * inside])
+        weighted = zones.T * weight
+        mixed = weighted @ jacobian
+        hidden = mixed @ inverse
+        gradient = jacobian.T @ (weight * state.misfit)
+        gradient[:_RAYS] -= self.dot.information @ self._miss(state)
+        return weighted @ state.misfit - hidden @ gradient, weighted @ zones - hidden @ mixed.T
+
     def _miss(self, state: _State) -> np.ndarray:
         miss: np.ndarray = (state.theta - self.dot.theta).T.ravel()
         return miss
@@ -336,6 +360,7 @@ def _summarise(problem: _Problem, state: _State, converged: bool) -> DotFit:
     normal, gradient = problem.normal_equations(state, weight, shared=True)
     inverse = np.linalg.inv(normal[:_OWN, :_OWN])
     hidden = normal[_OWN:, :_OWN] @ inverse
+    zone_pull, zone_information = problem.zone_equations(state, weight, inverse)
     relative = state.misfit / np.maximum(np.abs(state.linear[1]) * problem.response, 1e-12)
     return DotFit(
         coefficients=state.theta,
@@ -343,6 +368,8 @@ def _summarise(problem: _Problem, state: _State, converged: bool) -> DotFit:
         pull=gradient[_OWN:] - hidden @ gradient[:_OWN],
         pull_information=normal[_OWN:, _OWN:] - hidden @ normal[:_OWN, _OWN:],
         following=-hidden[:, :_RAYS].T,
+        zone_pull=zone_pull.astype(np.float32),
+        zone_information=zone_information.astype(np.float32),
         base=float(state.linear[0]),
         amplitude=float(state.linear[1]),
         reduced_chi2=float(np.mean(np.minimum(state.misfit**2 * weight, _ROBUST_SIGMA**2))),

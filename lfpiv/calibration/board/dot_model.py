@@ -1,8 +1,9 @@
 """Light that a pixel receives from one dot: a local ray model, and the dot integrated over microlens and pixel.
 
 On the plane of the array the rays of a dot follow s(u) = Phi(u) theta + Psi(u) b, with slope K = ds/du at the pupil
-point u. Phi holds the powers of u up to the second; each dot has its own coefficients theta. Psi holds third powers;
-all dots of a camera share their coefficients b, the bend. A ray that leaves the dot at d from its centre lands at
+point u. Phi holds the powers of u up to the second; each dot has its own coefficients theta. Psi holds the powers from
+the third to the order that the lens needs; all dots of a camera share their coefficients b, the bend. A ray that
+leaves the dot at d from its centre lands at
 s(u) + A(u) d, where A is d(s, t)/d(x, y) of the board, linear in u where the board is tilted. The pixel at X under the
 lens s_l sees the pupil point u_i = -(X - X_c) s_i / f_m through the lens's centre (see `lfpiv.lightfield.decoder`). Its
 rays obey X = s_l + (f_m/s_i)(s - u) (Eq. 9), so they land at
@@ -22,7 +23,7 @@ pupil. Where K changes over the pupil, the second moments of each pixel's own im
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft, special
@@ -30,8 +31,10 @@ from scipy.spatial import Voronoi
 
 from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, Optics, float_pair, spread_over_pupil
 
-_BEND_ORDER = 3
-_POWERS = [(order - j, j) for order in range(_BEND_ORDER + 1) for j in range(order + 1)]  # of (u, v)
+BEND_ORDERS = (3, 5)
+"""Orders of a bend that are tried in turn: uneven, as the aberrations of a centred lens in the middle of its field."""
+
+_POWERS = [(order - j, j) for order in range(BEND_ORDERS[-1] + 1) for j in range(order + 1)]  # of (u, v)
 
 Basis = tuple[tuple[float, float], ...]
 """Two lattice vectors (s, t) [mm]."""
@@ -39,8 +42,9 @@ Basis = tuple[tuple[float, float], ...]
 TERMS = 6
 """Terms of a dot's own ray model per coordinate: 1, u, v, u^2, u v, v^2, with (u, v) in pupil radii."""
 
-BENDS = len(_POWERS) - TERMS
-"""Terms of the bend per coordinate: u^3, u^2 v, u v^2, v^3."""
+_RINGS, _SECTORS = (0.35, 0.6, 0.8, 0.9), 8  # radii between rings of zones, zones of all but the inner one
+ZONES = 1 + len(_RINGS) * _SECTORS
+"""Zones of the pupil in which rays are judged: a disc and rings of eight sectors."""
 
 TABLE = 96
 """Elements per side of a table of F."""
@@ -62,7 +66,19 @@ class SharedParameters:
     blur_px: float
     """Blur of sensor and microlenses, standard deviation [pixel]."""
     bend_mm: np.ndarray
-    """Third-order coefficients b of the ray model [mm], shape (BENDS, 2)."""
+    """Coefficients b of the ray model, of third order and higher [mm], shape (`bends`, 2)."""
+
+    @property
+    def order(self) -> int:
+        """Order of the bend."""
+        return order_of(self.bend_mm)
+
+    def of_order(self, order: int) -> SharedParameters:
+        """Return the same parameters with a bend of another order; terms that it lacks are zero."""
+        bend = np.zeros((bends(order), 2))
+        common = min(len(bend), len(self.bend_mm))
+        bend[:common] = self.bend_mm[:common]
+        return replace(self, bend_mm=bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +106,46 @@ class LensIntegral:
         rays: np.ndarray = terms @ self._bent(theta)
         return rays
 
+    def pixel_terms(self, pupil_mm: np.ndarray) -> np.ndarray:
+        """Return the terms of the ray model in the mean over the rays of each pixel, shape (n, TERMS + bends).
+
+        A pixel and its blur are taken as a Gaussian of their variance, cut off by the edge of the pupil. Where rays are
+        bent to third order at most, the terms are those of the pixel's middle.
+
+        Parameters
+        ----------
+        pupil_mm : ndarray, shape (n, 2)
+            Pupil points seen from the middle of each pixel through the lens's centre [mm].
+        """
+        radius, order = self.optics.pupil_radius_mm, self.shared.order
+        pupil = np.asarray(pupil_mm, float) / radius
+        if order == BEND_ORDERS[0]:
+            return ray_terms(pupil, 1.0, order)
+        sigma = self.optics.pupil_pixel_mm / radius * np.sqrt(1 / 12 + self.shared.blur_px**2)
+        distance = np.maximum(np.linalg.norm(pupil, axis=1), 1e-9)
+        along = pupil / distance[:, None]
+        inside = (1 - distance) / sigma  # of the edge, which is straight for so small a pixel
+        cut = np.exp(-(inside**2) / 2) / np.sqrt(2 * np.pi) / np.maximum(special.ndtr(inside), 1e-9)
+        terms = ray_terms(pupil - (sigma * cut)[:, None] * along, 1.0, order)
+        per_u, per_v = _derivatives(order)
+        lower = len(per_u) - order  # terms of second derivatives
+        less = (inside + cut) * cut  # of the variance along the radius
+        for first, second, part in (
+            (per_u, per_u, 1 - less * along[:, 0] ** 2),
+            (per_v, per_v, 1 - less * along[:, 1] ** 2),
+            (per_u, per_v, -2 * less * along[:, 0] * along[:, 1]),
+        ):
+            change = first[:lower, : len(second)] @ second
+            terms += (sigma**2 / 2 * part)[:, None] * (terms[:, :lower] @ change)
+        return terms
+
     def offset_mm(self, terms: np.ndarray, theta: np.ndarray, lens_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where the central ray of each pixel lands from its lens's centre, g, and the factor (I - K)^-1.
 
         Parameters
         ----------
-        terms : ndarray, shape (n, TERMS + BENDS)
-            `ray_terms` at the pupil points u_i.
+        terms : ndarray, shape (n, TERMS + bends)
+            `pixel_terms` of the pupil points u_i.
         theta : ndarray, shape (TERMS, 2)
             Ray model of the dot [mm].
         lens_mm : ndarray, shape (n, 2)
@@ -151,8 +200,8 @@ class LensIntegral:
 
     def _inverse(self, terms: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return (I - K)^-1 with K = ds/du, shape (2, 2, n)."""
-        bent = self._bent(theta)
-        slope = (terms[:, : len(_PER_U)] @ np.hstack([_PER_U @ bent, _PER_V @ bent])).T / self.optics.pupil_radius_mm
+        bent, (per_u, per_v) = self._bent(theta), _derivatives(self.shared.order)
+        slope = (terms[:, : len(per_u)] @ np.hstack([per_u @ bent, per_v @ bent])).T / self.optics.pupil_radius_mm
         a, b, c, d = 1 - slope[0], -slope[2], -slope[1], 1 - slope[3]
         inverse: np.ndarray = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
         return inverse
@@ -165,7 +214,7 @@ class LensIntegral:
 
     def _pixel(self, theta: np.ndarray) -> np.ndarray:
         """Return the sides of a pixel's image on the array, as columns [mm], mean square over the pupil."""
-        inverse = self._inverse(_spread_terms(self.optics.pupil_radius_mm), theta)
+        inverse = self._inverse(_spread_terms(self.optics.pupil_radius_mm, self.shared.order), theta)
         sides = np.moveaxis(inverse, -1, 0) - np.eye(2)  # (I - K)^-1 K
         spread, axes = np.linalg.eigh(np.einsum("nab,ncb->ac", sides, sides) / len(sides))
         size = axes * np.sqrt(np.maximum(spread, 0)) @ axes.T
@@ -248,14 +297,45 @@ class LensTable:
         return values[:, 0], values[:, 1:3], values[:, 3:]
 
 
-def ray_terms(pupil_mm: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
-    """Return the terms Phi, then Psi, of the ray model at pupil points (u, v) [mm], shape (n, TERMS + BENDS)."""
+def bends(order: int) -> int:
+    """Return the number of terms per coordinate of a bend: powers of (u, v) from the third to this order."""
+    return (order + 1) * (order + 2) // 2 - TERMS
+
+
+def order_of(bend: np.ndarray) -> int:
+    """Return the order of a bend, shape (bends, 2)."""
+    return next(order for order in BEND_ORDERS if bends(order) == len(bend))
+
+
+def ray_terms(pupil_mm: np.ndarray, pupil_radius_mm: float, order: int) -> np.ndarray:
+    """Return the terms Phi, then Psi up to an order, at pupil points (u, v) [mm], shape (n, TERMS + bends)."""
     u, v = (np.asarray(pupil_mm) / pupil_radius_mm).T
-    terms = np.ones((len(u), len(_POWERS)))
-    for column, (i, j) in enumerate(_POWERS[1:], 1):
+    terms = np.ones((len(u), TERMS + bends(order)))
+    for column, (i, j) in enumerate(_POWERS[1 : terms.shape[1]], 1):
         lower = _POWERS.index((i - 1, j) if i else (i, j - 1))
         terms[:, column] = terms[:, lower] * (u if i else v)
     return terms
+
+
+def zone_of(pupil: np.ndarray) -> np.ndarray:
+    """Return the zone of pupil points [pupil radii], shape (n,)."""
+    ring = np.searchsorted(_RINGS, np.linalg.norm(pupil, axis=1))
+    sector = np.floor(np.arctan2(pupil[:, 1], pupil[:, 0]) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    return np.where(ring == 0, 0, 1 + (ring - 1) * _SECTORS + sector)
+
+
+def zone_shares() -> np.ndarray:
+    """Return the zones' shares of the pupil's area, shape (ZONES,)."""
+    rings = np.diff(np.array([0, *_RINGS, 1]) ** 2)
+    return np.append(rings[0], np.repeat(rings[1:] / _SECTORS, _SECTORS))
+
+
+def zone_middles() -> np.ndarray:
+    """Return the middles of the zones [pupil radii], shape (ZONES, 2)."""
+    edge = np.array([*_RINGS, 1])
+    radius = np.append(0, np.repeat((edge[1:] + edge[:-1]) / 2, _SECTORS))
+    angle = np.append(0, np.tile((np.arange(_SECTORS) + 0.5) / _SECTORS * 2 * np.pi, len(_RINGS)))
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def slope_of(theta: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
@@ -271,22 +351,21 @@ def _cell_reach(basis: Basis) -> np.ndarray:
     return reach
 
 
-def _derivative(axis: int) -> np.ndarray:
-    """Return the matrix of d/du or d/dv, from the terms of the ray model to the terms of one order less."""
-    matrix = np.zeros((len(_POWERS) - _BEND_ORDER - 1, len(_POWERS)))
-    for column, power in enumerate(_POWERS):
-        if power[axis]:
-            lower = (power[0] - 1, power[1]) if axis == 0 else (power[0], power[1] - 1)
-            matrix[_POWERS.index(lower), column] = power[axis]
-    return matrix
-
-
-_PER_U, _PER_V = _derivative(0), _derivative(1)
+@functools.cache
+def _derivatives(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrices of d/du and d/dv, from the terms of a ray model to the terms of one order less."""
+    matrices = np.zeros((2, TERMS + bends(order) - order - 1, TERMS + bends(order)))
+    for column, (i, j) in enumerate(_POWERS[: matrices.shape[2]]):
+        if i:
+            matrices[0, _POWERS.index((i - 1, j)), column] = i
+        if j:
+            matrices[1, _POWERS.index((i, j - 1)), column] = j
+    return matrices[0], matrices[1]
 
 
 @functools.lru_cache(maxsize=8)
-def _spread_terms(pupil_radius_mm: float) -> np.ndarray:
-    return ray_terms(spread_over_pupil(pupil_radius_mm), pupil_radius_mm)
+def _spread_terms(pupil_radius_mm: float, order: int) -> np.ndarray:
+    return ray_terms(spread_over_pupil(pupil_radius_mm), pupil_radius_mm, order)
 
 
 @functools.lru_cache(maxsize=32)

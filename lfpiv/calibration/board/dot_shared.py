@@ -1,6 +1,7 @@
 """Parameters of one camera that its dots share: diameter, blur and bend; and the noise and response of its pixels.
 
-The bend is the third-order part of the rays over the pupil, mostly spherical aberration. One dot measures the shared
+The bend is the part of the rays over the pupil of third order and higher, mostly spherical aberration. Its order is the
+lowest after which the dots show no higher terms. One dot measures the shared
 parameters poorly, all dots measure them well. Each `DotFit` holds the Gauss-Newton equations of the shared
 parameters with the dot's own unknowns eliminated, so the sum of these equations over the dots is the joint fit of all.
 """
@@ -15,8 +16,17 @@ import numpy as np
 from scipy import stats
 
 from lfpiv.calibration.board.dot_fit import BoardPixels, DotFit, converged, fit_dots
-from lfpiv.calibration.board.dot_model import BENDS, TERMS, LensIntegral, SharedParameters, ray_terms
+from lfpiv.calibration.board.dot_model import (
+    BEND_ORDERS,
+    TERMS,
+    LensIntegral,
+    SharedParameters,
+    bends,
+    order_of,
+    ray_terms,
+)
 from lfpiv.calibration.board.dots import ExpectedDot
+from lfpiv.geometry.optics import spread_over_pupil
 from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.warn import Code, Warning, warn
 
@@ -30,6 +40,7 @@ _SIZE_PRIOR = (0.3, 0.5)  # standard deviation of the prior on log(diameter) and
 _BEND_PRIOR_PITCHES = 0.5  # standard deviation of the prior on each term of the bend
 _NOTABLE = 0.1  # error of the stated diameter that is worth a warning [logarithm]
 _CHANCE = 1e-3  # probability that dots without a bend show one by chance
+_WORTH = 0.97  # a higher order must lower the typical residual to this part
 _OUTLIER_CHI2 = 2.0  # fits with this many times the typical residual are left out
 _SHARE = 0.3  # pixels with at least this part of the largest share of a dot measure noise and pixel response
 _CALM_SIGMA, _CALM_DEVIATION = 4.0, 0.5  # pixels further off in light or response are left out
@@ -47,17 +58,40 @@ def estimate_shared(
     at all depths, the blur grows with the slope of the rays, so planes at different depths separate the two. The
     fitted pixels reach `margin_mm` beyond the expected light of a dot.
     """
-    optics, lattice = pixels.decoder.optics, pixels.decoder.lattice
     chosen = np.unique(np.linspace(0, len(expected) - 1, _SAMPLE).astype(int))
     sample = [expected[k] for k in chosen]
-    pitch = optics.microlens_pitch_mm
-    prior = np.array([*_SIZE_PRIOR, *[_BEND_PRIOR_PITCHES] * (2 * BENDS)])
-    unit = np.array([1, 1, *[pitch] * (2 * BENDS)])
+    shared, found = _fit_shared(pixels, sample, stated_diameter_mm, margin_mm)
+    none = np.zeros(shared.bend_mm.size, bool)
+    bent = _common_bend(found, shared, pixels.decoder.optics.microlens_pitch_mm, none)[1] < _CHANCE
+    for order in BEND_ORDERS[1:] if bent else ():
+        higher = _higher(pixels, sample, shared, order, found, margin_mm)
+        if higher is None:
+            break
+        shared, found = higher
+    if abs(np.log(shared.diameter_mm / stated_diameter_mm)) > _NOTABLE:
+        figures = {"seen_mm": shared.diameter_mm, "stated_mm": stated_diameter_mm}
+        warn(log, Warning(code=Code.DOT_WIDTH, figures=figures))
+    return shared
+
+
+def _model(pixels: BoardPixels, shared: SharedParameters) -> LensIntegral:
+    return LensIntegral(pixels.decoder.optics, pixels.decoder.lattice, shared)
+
+
+def _fit_shared(
+    pixels: BoardPixels,
+    sample: Sequence[ExpectedDot],
+    stated_diameter_mm: float,
+    margin_mm: float,
+) -> tuple[SharedParameters, Sequence[DotFit | None]]:
+    """Fit the shared parameters with a bend of third order to some dots."""
+    pitch, count = pixels.decoder.optics.microlens_pitch_mm, 2 * bends(BEND_ORDERS[0])
+    prior = np.array([*_SIZE_PRIOR, *[_BEND_PRIOR_PITCHES] * count])
+    unit = np.array([1, 1, *[pitch] * count])
     at = np.zeros(len(prior))  # log(diameter / stated), blur^2 [pixel^2], bend [pitch]
     found: Sequence[DotFit | None] | None = None
     for _ in range(_ROUNDS):
-        model = LensIntegral(optics, lattice, _shared(at, stated_diameter_mm, pitch))
-        found = fit_dots(model, pixels, sample, margin_mm, found)
+        found = fit_dots(_model(pixels, _shared(at, stated_diameter_mm, pitch)), pixels, sample, margin_mm, found)
         fits, typical = _typical(found)
         if not fits:
             break
@@ -71,18 +105,49 @@ def estimate_shared(
         at = at + change
         if np.abs(change).max() < _CHANGE:
             break
-    shared = _shared(at, stated_diameter_mm, pitch)
-    if abs(at[0]) > _NOTABLE:
-        figures = {"seen_mm": shared.diameter_mm, "stated_mm": stated_diameter_mm}
-        warn(log, Warning(code=Code.DOT_WIDTH, figures=figures))
-    return shared
+    return _shared(at, stated_diameter_mm, pitch), found or []
+
+
+def _higher(
+    pixels: BoardPixels,
+    sample: Sequence[ExpectedDot],
+    lower: SharedParameters,
+    order: int,
+    found: Sequence[DotFit | None],
+    margin_mm: float,
+) -> tuple[SharedParameters, Sequence[DotFit | None]] | None:
+    """Fit a bend of a higher order to some dots; None unless they show it beyond chance and fit better with it.
+
+    Steps go on as long as the typical residual falls much. Diameter and blur stay, because rays that are still bent
+    within a pixel look like blur.
+    """
+    pitch, shared, best = pixels.decoder.optics.microlens_pitch_mm, lower.of_order(order), None
+    known = np.tile(np.arange(len(shared.bend_mm)) < len(lower.bend_mm), 2)
+    found = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, found)
+    typical = _typical(found)[1]
+    bend, chance = _common_bend(found, shared, pitch, known)
+    if not chance < _CHANCE:
+        return None
+    for _ in range(_ROUNDS):
+        change = bend - shared.bend_mm
+        change *= min(1.0, _LARGEST_CHANGE * pitch / max(_largest(change), 1e-12))
+        shared = replace(shared, bend_mm=shared.bend_mm + change)
+        found = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, follow_bend(found, change))
+        now = _typical(found)[1]
+        if now < (typical if best else _WORTH * typical):
+            best = shared, found
+        if not now < _WORTH * typical:
+            break
+        typical = now
+        bend, _ = _common_bend(found, shared, pitch, np.zeros(len(known), bool))
+    return best
 
 
 def _shared(at: np.ndarray, stated_diameter_mm: float, pitch: float) -> SharedParameters:
     return SharedParameters(
         diameter_mm=float(stated_diameter_mm * np.exp(at[0])),
         blur_px=float(np.sqrt(at[1])),
-        bend_mm=pitch * at[2:].reshape(2, BENDS).T,
+        bend_mm=pitch * at[2:].reshape(2, -1).T,
     )
 
 
@@ -96,28 +161,43 @@ def _typical(fits: Sequence[DotFit | None]) -> tuple[list[DotFit], float]:
 def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch_mm: float) -> SharedParameters:
     """Return the shared parameters with the bend that all dots show; no bend where chance explains it.
 
+    `fits` are the fits of all dots by `shared` and by weak priors.
+    """
+    bend, chance = _common_bend(fits, shared, pitch_mm, np.zeros(shared.bend_mm.size, bool))
+    if chance >= _CHANCE:
+        bend = np.zeros_like(bend)
+    else:
+        text = "aberrations bend rays at the rim of the main lens by %.2g microlens pitches (rms)"
+        log.info(text, _edge(bend) / pitch_mm)
+    return replace(shared, bend_mm=bend)
+
+
+def _common_bend(
+    fits: Sequence[DotFit | None], shared: SharedParameters, pitch_mm: float, known: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the bend that dots have in common [mm], and the chance of dots without any but the `known` terms.
+
     The bends of single dots scatter about the common bend, by model errors too. An F-test compares the common bend with
-    that scatter. Without the test the noise would give a perfect lens a bend. `fits` are the fits of all dots by
-    `shared` and by weak priors.
+    that scatter. Without the test the noise would give a perfect lens a bend.
     """
     sure, typical = _typical(fits)
     start = shared.bend_mm.T.ravel()
-    bend = np.zeros_like(start)
-    if len(sure) > 1:
-        information = np.stack([fit.pull_information[2:, 2:] for fit in sure]) / typical
-        pull = np.stack([fit.pull[2:] for fit in sure]) / typical + information @ start  # relative to no bend
-        prior = np.eye(len(start)) / (_BEND_PRIOR_PITCHES * pitch_mm) ** 2
-        total = information.sum(0) + prior
-        found = np.linalg.solve(total, pull.sum(0))
-        miss = pull - information @ found
-        scatter = np.einsum("ka,ka->", miss, np.linalg.solve(information + prior, miss[..., None])[..., 0])
-        freedom = len(start) * (len(sure) - 1)
-        ratio = found @ total @ found / len(start) / (scatter / freedom)
-        if float(stats.f.sf(ratio, len(start), freedom)) < _CHANCE:
-            bend = found
-            text = "aberrations bend rays at the rim of the main lens by %.2g microlens pitches (rms)"
-            log.info(text, _edge(bend) / pitch_mm)
-    return replace(shared, bend_mm=bend.reshape(2, BENDS).T)
+    if len(sure) < 2:
+        return np.zeros_like(shared.bend_mm), 1.0
+    information = np.stack([fit.pull_information[2:, 2:] for fit in sure]) / typical
+    pull = np.stack([fit.pull[2:] for fit in sure]) / typical + information @ start  # relative to no bend
+    prior = np.eye(len(start)) / (_BEND_PRIOR_PITCHES * pitch_mm) ** 2
+    total = information.sum(0) + prior
+    found = np.linalg.solve(total, pull.sum(0))
+    miss = pull - information @ found
+    scatter = np.einsum("ka,ka->", miss, np.linalg.solve(information + prior, miss[..., None])[..., 0])
+    gain = found @ total @ found
+    if known.any():
+        less = np.linalg.solve(total[known][:, known], pull.sum(0)[known])
+        gain -= less @ pull.sum(0)[known]
+    freedom, free = len(start) * (len(sure) - 1), len(start) - known.sum()
+    chance = float(stats.f.sf(gain / free / (scatter / freedom), free, freedom))
+    return found.reshape(2, -1).T, chance
 
 
 def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[DotFit | None]:
@@ -129,11 +209,19 @@ def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[Do
     ]
 
 
-def _edge(bend: np.ndarray) -> float:
+def _largest(bend: np.ndarray) -> float:
+    """Return the largest displacement of a ray by a bend over the pupil."""
+    order = order_of(bend)
+    rays = ray_terms(spread_over_pupil(1.0), 1.0, order)[:, TERMS:] @ bend
+    return float(np.linalg.norm(rays, axis=1).max())
+
+
+def _edge(bend_mm: np.ndarray) -> float:
     """Return the root mean square of a bend over the pupil's edge [mm]."""
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    edge = ray_terms(np.stack([np.cos(angle), np.sin(angle)], 1), 1.0)[:, TERMS:]
-    return float(np.sqrt(((edge @ bend.reshape(2, BENDS).T) ** 2).sum(1).mean()))
+    order = order_of(bend_mm)
+    edge = ray_terms(np.stack([np.cos(angle), np.sin(angle)], 1), 1.0, order)[:, TERMS:]
+    return float(np.sqrt(((edge @ bend_mm) ** 2).sum(1).mean()))
 
 
 def estimate_pixels(pixels: BoardPixels, fits: Sequence[DotFit | None]) -> BoardPixels:

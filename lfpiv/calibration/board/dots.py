@@ -165,6 +165,9 @@ class Labels:
     """Diameter of the dots as the images show it [mm]; the stated one for the Gaussian estimator."""
     blur_px: float
     """Blur of sensor and microlenses, standard deviation [pixel]; nan for the Gaussian estimator."""
+    left_over_mm: np.ndarray
+    """Displacement of rays that their pixels show beside the labels, by part of the field and zone of the pupil [mm],
+    shape (PARTS, ZONES, 2); zero where they show none, and for the Gaussian estimator."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -20,6 +20,7 @@ from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, e
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard, Labels, expect_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
+from lfpiv.calibration.board.pupil_zones import left_over
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
@@ -243,12 +244,12 @@ def _spiral(dot: int, radius_mm: float) -> np.ndarray:
 def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegral, response_share: float) -> Labels:
     """Sample the fitted ray models, by dot number, at pupil points near which each dot was seen."""
     radius = model.optics.pupil_radius_mm
-    near = (_SEEN_PIXELS * model.optics.pupil_pixel_mm) ** 2
+    near, pitch = (_SEEN_PIXELS * model.optics.pupil_pixel_mm) ** 2, model.optics.microlens_pitch_mm
     pupil, array, std = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0)]
     for dot, fit in measured.items():
         points = _spiral(dot, radius)
         points = points[(((points[:, None] - fit.seen_pupil_mm[None]) ** 2).sum(-1) < near).any(1)]
-        terms = ray_terms(points, radius)
+        terms = ray_terms(points, radius, model.shared.order)
         covariance = fit.covariance[:TERMS, :TERMS] + fit.covariance[TERMS:, TERMS:]
         variance = np.einsum("va,ab,vb->v", terms[:, :TERMS], covariance, terms[:, :TERMS]) / 2
         pupil.append(points)
@@ -268,4 +269,5 @@ def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegr
         response_share=response_share,
         diameter_mm=model.shared.diameter_mm,
         blur_px=model.shared.blur_px,
+        left_over_mm=left_over(list(fits), np.array([fit.coefficients[0] for fit in fits]).reshape(-1, 2), pitch),
     )

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lfpiv.calibration.board.dot_model import ZONES
 from lfpiv.calibration.board.dots import Detection, DotBoard, Labels
 from lfpiv.calibration.board.planes import Signals
+from lfpiv.calibration.board.pupil_zones import PARTS
 from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, spread_over_pupil
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
@@ -57,6 +59,7 @@ def label_by_gaussian(signals: Signals, decoder: LightFieldDecoder, board: DotBo
         response_share=np.nan,
         diameter_mm=board.diameter_mm,
         blur_px=np.nan,
+        left_over_mm=np.zeros((PARTS, ZONES, 2)),
     )
 
 
