@@ -97,7 +97,7 @@ def calibrated(tmp_path_factory):
             particles = {"count": 10, "pairs": 1}
             scene = scenes.scene(
                 *("real", [camera]),
-                planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8),
+                planes_mm=(-0.8, -0.2, 0.4),
                 particles=particles,
                 displacement_mm=(0.05, 0, 0),
             )

@@ -321,7 +321,8 @@ def zone_of(pupil: np.ndarray) -> np.ndarray:
     """Return the zone of pupil points [pupil radii], shape (n,)."""
     ring = np.searchsorted(_RINGS, np.linalg.norm(pupil, axis=1))
     sector = np.floor(np.arctan2(pupil[:, 1], pupil[:, 0]) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-    return np.where(ring == 0, 0, 1 + (ring - 1) * _SECTORS + sector)
+    zone: np.ndarray = np.where(ring == 0, 0, 1 + (ring - 1) * _SECTORS + sector)
+    return zone
 
 
 def zone_shares() -> np.ndarray:
@@ -335,7 +336,8 @@ def zone_middles() -> np.ndarray:
     edge = np.array([*_RINGS, 1])
     radius = np.append(0, np.repeat((edge[1:] + edge[:-1]) / 2, _SECTORS))
     angle = np.append(0, np.tile((np.arange(_SECTORS) + 0.5) / _SECTORS * 2 * np.pi, len(_RINGS)))
-    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    middles: np.ndarray = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return middles
 
 
 def slope_of(theta: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
