@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -24,61 +24,14 @@ from lfpiv.files import replacing, writing
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs.frame_light import FrameLight, compare
+from lfpiv.runs.frame_work import FrameWork
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import CalibratedCamera
-    from lfpiv.experiment.experiment import Experiment
-    from lfpiv.runs.pair_volumes import Followed
-    from lfpiv.sequence.solver import Before
     from lfpiv.warn import Warning
 
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-
-
-class FrameWork(Protocol):
-    """The work on one frame, which `lfpiv.runs.pair` does."""
-
-    @property
-    def experiment(self) -> Experiment:
-        """The experiment, which numbers the frames."""
-
-    @property
-    def cameras(self) -> Mapping[str, CalibratedCamera]:
-        """Cameras that know what stands still in their images."""
-
-    @property
-    def keep_volumes(self) -> bool:
-        """Whether volumes are written into the output folder."""
-
-    @property
-    def scratch(self) -> Path | None:
-        """Folder in which processes store volumes for each other; None for a process by itself."""
-
-    def require_weights(self, file: VolumeFile) -> None:
-        """Raise InputError if a volume that is not in the folder cannot be reconstructed."""
-
-    def light_again(self, frame: Frame) -> FrameLight:
-        """Read the images of a frame, also if its volume is known."""
-
-    def log_warnings(self, pair: int, warnings: Sequence[Warning]) -> None:
-        """Log the first warning of each code about a pair or its frames."""
-
-    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one frame by itself."""
-
-    def reconstruct_pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
-        """Reconstruct both frames of an image pair together."""
-
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct a frame of a series from its predecessor; return it and what its successor needs."""
-
-    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one of successive frames again from those before and after it."""
-
-    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
-        """Start to write a result of the present pair."""
 
 
 class Failure(Exception):
@@ -140,7 +93,7 @@ class Frames:
         between = self._complete(files, progress)
         first, second = (_usable(self.held[file.frame]).volume for file in files.frames)
         assert first is not None and second is not None
-        return PairVolumes(frames=(first, second), names=self.work.experiment.frames, between=between)
+        return PairVolumes(frames=(first, second), names=self.work.experiment.frames, between=tuple(between))
 
     def clear(self) -> None:
         """Forget the frames and remove files of other processes that no one needs any more."""
@@ -175,7 +128,8 @@ class Frames:
         for number, one in enumerate(new):
             assert one.light is not None
             step = part_of(progress, number / len(new), (number + 1) / len(new))
-            found = attempted(partial(self.work.reconstruct, one.light, step))
+            self.work.writer.wait_large()
+            found = attempted(partial(self.work.reconstructor.frame, one.light, step))
             if isinstance(found, Failure):
                 self.held[one.frame] = found
             else:
@@ -251,7 +205,8 @@ class JointFrames(Frames):
     def _reconstruct(self, new: Sequence[HeldFrame], both: Sequence[HeldFrame], progress: StepProgress) -> None:
         if new:
             lights = [one.light or self.work.light_again(one.frame) for one in both]
-            both[0].volume, both[1].volume = self.work.reconstruct_pair(lights, progress)
+            self.work.writer.wait_large()
+            both[0].volume, both[1].volume = self.work.reconstructor.pair(lights, progress)
 
 
 def attempted(work: Callable[[], Result]) -> Result | Failure:

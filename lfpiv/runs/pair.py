@@ -9,75 +9,50 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from lfpiv import warn
-from lfpiv.errors import InputError, StorageError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.errors import StorageError
 from lfpiv.experiment.recording import Frame
-from lfpiv.geometry.grid import Layers
 from lfpiv.joint.field import joint_field
 from lfpiv.joint.vectors import is_joint
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.folder import Folder
-from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
+from lfpiv.results.pair_files import PairFiles, PairVolumes
 from lfpiv.runs import belonging, pair_figures
-from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
+from lfpiv.runs.frame_work import FrameWork
 from lfpiv.runs.frames import Frames, JointFrames, failure
 from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import REFUSED, measure_vectors, without_unmeasured
-from lfpiv.runs.pair_volumes import Followed, Reconstructor, reconstruction_s
+from lfpiv.runs.pair_volumes import Reconstructor, reconstruction_s
 from lfpiv.runs.particles import FrameFits, refused, track
 from lfpiv.runs.sequences import FollowedFrames
-from lfpiv.runs.side_threads import ReadAhead, Writer
-from lfpiv.sequence.solver import Before
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.link_vectors import vectors_from_links
 from lfpiv.velocity.cross_correlation import Verdict
-from lfpiv.warn import Code, FirstOfEachCode, Warning
-
-if TYPE_CHECKING:
-    from lfpiv.calibration.camera import CalibratedCamera
-    from lfpiv.weights.operator import Weights
+from lfpiv.warn import Code, Warning
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairWork:
+class PairWork(FrameWork):
     """The work on each pair of an experiment, with all its inputs."""
 
-    experiment: Experiment
     folder: Folder
     calibration_hash: str
-    guard: Layers
-    """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
-    refinement: float
-    """Edge of a voxel of the experiment over that of the weights, which volumes are sampled from."""
-    weights: Weights | None
-    """None if all volumes are in the folder."""
-    cameras: Mapping[str, CalibratedCamera]
-    """Cameras that know what stands still in their images; empty if no image is read."""
-    keep_volumes: bool
-    """Write the volumes."""
     background: str | None = None
     """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
     refusals: tuple[Warning, ...] = ()
     """Why the vectors of all pairs, or of some, are not valid; see `belonging.check`."""
-    scratch: Path | None = None
-    """Folder in which processes store volumes for each other; None for a process by itself."""
-    log_first: FirstOfEachCode = field(default_factory=lambda: FirstOfEachCode(log))
 
     def do(self, pairs: Iterable[int], progress: PairProgress, *, stored: Collection[int] = ()) -> Iterator[Outcome]:
         """Work on pairs, one after the other; yield the outcome of each.
@@ -136,46 +111,6 @@ class PairWork:
             frames = [frame for number, frame in both if not self.folder.volume(coming, number).exists()]
         self.images.start(frames, self.experiment.pair_frames(pair))
 
-    def write(self, write: Callable[[], None], *, large: bool = False) -> None:
-        """Start to write a result of the present pair. `large` ones are written before the next reconstruction."""
-        self.written.append(self.writer.start(write, large=large))
-
-    @cached_property
-    def darks(self) -> Mapping[str, np.ndarray | None]:
-        """Dark image of every camera [counts]."""
-        return read_darks(self.experiment)
-
-    @cached_property
-    def images(self) -> ReadAhead:
-        """Images that are read while others are reconstructed."""
-        return ReadAhead(self.experiment)
-
-    @cached_property
-    def recent(self) -> dict[Frame, FrameLight]:
-        """Light of the frames that were read last, so that particles are found without reading the images again."""
-        return {}
-
-    @cached_property
-    def writer(self) -> Writer:
-        """Thread that writes results."""
-        return Writer()
-
-    @cached_property
-    def written(self) -> list[Future[None]]:
-        """Results of the present pair that are being written."""
-        return []
-
-    @cached_property
-    def reconstructor(self) -> Reconstructor:
-        """SMART with the weights, made once for all pairs."""
-        assert self.weights is not None
-        return Reconstructor(
-            experiment=self.experiment,
-            weights=self.weights,
-            guard=self.guard,
-            refinement=self.refinement,
-        )
-
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
         return PairFiles.of(
@@ -203,66 +138,6 @@ class PairWork:
         """Return the volumes of a pair, with the refusals of the pair; raise as `Frames.volumes`."""
         both = frames.volumes(files, progress)
         return replace(both, between=(*both.between, *belonging.of_pair(self.experiment, self.refusals, files.pair)))
-
-    def require_weights(self, file: VolumeFile) -> None:
-        """Raise InputError if there are no weights because all volumes should be in the folder."""
-        if self.weights is None:
-            raise InputError(
-                f"{file.path}: expected the volume of {file.frame.label} made with the present settings, found none. "
-                "Run `lfpiv reconstruct` first."
-            )
-
-    def light_again(self, frame: Frame) -> FrameLight:
-        """Read the images of a frame, also if its volume is known; raise InputError if that is not possible."""
-        if not self.cameras:
-            raise InputError(f"{frame.label}: no image is read in this step.")
-        if (known := self.recent.get(frame)) is not None:
-            return known
-        light = frame_light(self.experiment, self.cameras, self.darks, frame, self.images.image)
-        if self.experiment.tracking is not None:  # particles are found in the two latest frames
-            self.recent[frame] = light
-            for old in list(self.recent)[:-2]:
-                del self.recent[old]
-        return light
-
-    def reconstruct(self, light: FrameLight, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one frame by itself; raise InputError if its images cannot be reconstructed."""
-        self.writer.wait_large()
-        return self.reconstructor.frame(light, progress)
-
-    def reconstruct_pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
-        """Reconstruct both frames of an image pair together; raise InputError if that is not possible."""
-        self.writer.wait_large()
-        return self.reconstructor.pair(light, progress)
-
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
-        """Reconstruct a frame of a series from its predecessor; return it and what its successor needs.
-
-        Raises
-        ------
-        InputError
-            If its images cannot be reconstructed.
-        """
-        frame = light.frame.number
-        self.log_warnings(frame, light.warnings)
-        self.writer.wait_large()
-        found, coming = self.reconstructor.follow(light, before, progress)
-        self.log_warnings(frame, found.light.warnings[len(light.warnings) :])
-        return found, coming
-
-    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
-        """Reconstruct one of successive frames again from those before and after it.
-
-        Raises
-        ------
-        InputError
-            If its images cannot be reconstructed.
-        """
-        return self.reconstructor.correct(trail, at, progress)
-
-    def log_warnings(self, pair: int, warnings: Iterable[Warning]) -> None:
-        """Log the first warning of each code about a pair or its frames."""
-        self.log_first([self.experiment.recording.by_result(warning.of_pair(pair)) for warning in warnings])
 
     def measure(
         self,

@@ -22,7 +22,8 @@ from lfpiv.experiment.segments import corrected_by, followed, segment_of
 from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.runs.frames import Failure, Frames, FrameWork, HeldFrame, attempted
+from lfpiv.runs.frame_work import FrameWork
+from lfpiv.runs.frames import Failure, Frames, HeldFrame, attempted
 from lfpiv.runs.pair_volumes import Followed
 from lfpiv.sequence.solver import Before, Start
 from lfpiv.warn import Code, Warning
@@ -154,7 +155,7 @@ class Segment:
         own = self.trail[number]
         if isinstance(own, Failure):
             return own
-        found = attempted(partial(self.work.correct, *self._beside(number), progress))
+        found = attempted(partial(self.work.reconstructor.correct, *self._beside(number), progress))
         return found if isinstance(found, Failure) else HeldFrame(own.light.frame, own.light, found)
 
     def _beside(self, number: int) -> tuple[list[Followed], int]:

@@ -27,13 +27,13 @@ from reconstruction_bench import CACHE
 from reconstruction_cases import CONDITIONS, SIZE_MM, Case, Recorded, make_flow, make_rig, record, true_field
 from reconstruction_ways import weights_of
 
+from lfpiv.damping import bootstrap
 from lfpiv.damping.particle_light import LightField
 from lfpiv.damping.synthetic_pair import RecordedImages, RecordedParticles, SyntheticPair
 from lfpiv.geometry.grid import Layers
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.geometry.volume import lies_in
 from lfpiv.joint.pair import PairSolver
-from lfpiv.reconstruction import bootstrap
 from lfpiv.reconstruction.refinement import measure_size, needed_refinement
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reproduce.rigs import DT_S, VOXEL_MM

@@ -31,7 +31,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
-from lfpiv.reconstruction import instant
+from lfpiv.reconstruction import frame as prepared_frame
 from lfpiv.reconstruction.smart import ImageEquations
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.reproduce import page, plots, store
@@ -172,9 +172,9 @@ def counted_reconstructions(cameras: int) -> Iterator[Counts]:
             (ImageEquations, "back_project", half),
             (ImageEquations, "compare_part", part),
             (ImageEquations, "exponent_of", back),
-            (instant, "multiplicative_guess", guess),
+            (prepared_frame, "multiplicative_guess", guess),
             (ImageFit, "unexplained", uncounted),  # the check of the cameras
-            (Reconstructor, "instant", timed),
+            (Reconstructor, "frame", timed),
             (Reconstructor, "follow", timed),
             (Reconstructor, "correct", timed),
         ):

@@ -25,7 +25,7 @@ import xarray as xr
 
 from lfpiv import metrics
 from lfpiv.experiment.opening import open_experiment
-from lfpiv.reconstruction import instant, sequence
+from lfpiv.reconstruction import frame as prepared_frame
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.runs import rig
@@ -34,6 +34,7 @@ from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import open_run
 from lfpiv.runs.sequences import Segment
+from lfpiv.sequence import solver as sequence
 from lfpiv.sequence.solver import SequenceSolver
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.series import place_series
@@ -76,10 +77,10 @@ PARTS = {
     "guess": (sequence, "predicted_guess"),
     "check": (PreparedFrame, "sampled_misfit"),
     "guess of the correction": (sequence, "agreed_guess"),
-    "first guess": (instant, "multiplicative_guess"),
-    "subsets": (instant, "_run_epochs"),
+    "first guess": (prepared_frame, "multiplicative_guess"),
+    "subsets": (prepared_frame, "_run_epochs"),
     "whole passes": (PreparedFrame, "_solve_whole"),
-    "all": (Reconstructor, "instant"),
+    "all": (Reconstructor, "frame"),
     "followed": (Reconstructor, "follow"),
     "corrected": (Reconstructor, "correct"),
 }

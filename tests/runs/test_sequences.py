@@ -13,11 +13,11 @@ from support.series_run import FIRST, Processes, changed, make_work, write_serie
 from support.small_run import damage, same_vectors
 
 from lfpiv.experiment import segments
-from lfpiv.reconstruction import sequence
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import dispatch
 from lfpiv.runs.stretches import cut_at_segments
+from lfpiv.sequence import solver as sequence
 from lfpiv.warn import Code
 
 INSTANTS = 7
