@@ -25,8 +25,8 @@ from lfpiv.runs import cluster_workers, local_workers, worker
 from lfpiv.runs.local_workers import Capacity
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
+from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut, cut_at_segments
-from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 from lfpiv.warn import name_pairs
 from lfpiv_kernels.runtime import cores
@@ -39,31 +39,33 @@ TICK_S = 0.5
 """Interval at which the state of the cluster is checked and progress is reported [s]."""
 
 
-def sequential(work: PairWork, todo: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
+def sequential(work: PairWork, pending: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
     """Do pairs one after the other in this process; yield the outcome of each.
 
-    Pairs are taken from `todo` when their turn comes; those of a series come along its chains. `length_hint`
+    Pairs are taken from `pending` when their turn comes; those of a series come along its chains. `length_hint`
     says how many may come.
     """
-    source = iter(todo)
+    source = iter(pending)
     total = max(length_hint(source), 1)
-    before = _kept(todo)
+    before = _kept(pending)
     progress(0.0)
-    yield from work.do(source, lambda number, fraction: progress((_kept(todo) - before + number + fraction) / total))
+    yield from work.do(source, lambda number, fraction: progress((_kept(pending) - before + number + fraction) / total))
 
 
-def _kept(todo: Iterable[int]) -> int:
+def _kept(pending: Iterable[int]) -> int:
     """Return the number of pairs that were passed over because they are finished."""
-    return todo.finished[1] if isinstance(todo, Todo) else 0
+    return pending.finished[1] if isinstance(pending, PendingPairs) else 0
 
 
-def _stretches(experiment: Experiment, todo: Iterable[int], workers: int) -> Iterable[Stretch]:
+def _stretches(experiment: Experiment, pending: Iterable[int], workers: int) -> Iterable[Stretch]:
     recording = experiment.recording
-    return cut_at_segments(todo, recording.step) if experiment.in_sequence else cut(todo, recording.chain, workers)
+    return (
+        cut_at_segments(pending, recording.step) if experiment.in_sequence else cut(pending, recording.chain, workers)
+    )
 
 
 def parallel(
-    shared: Path, experiment: Experiment, todo: Iterable[int], workers: Plan | str, progress: StepProgress
+    shared: Path, experiment: Experiment, pending: Iterable[int], workers: Plan | str, progress: StepProgress
 ) -> Generator[Outcome, None, None]:
     """Do pairs in parallel, in any order; yield the outcome of each.
 
@@ -72,7 +74,7 @@ def parallel(
     shared : Path
         Folder with everything that the workers need, from `task.write_task`.
     experiment : Experiment
-    todo : iterable of int
+    pending : iterable of int
         Pairs to do; each is taken when a worker is free.
     workers : Plan or str
         Processes to start on this machine, or the address of a Dask scheduler whose workers see `shared`.
@@ -93,8 +95,8 @@ def parallel(
     found = (
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
-    total = max(length_hint(todo), 1)
-    stretches = _stretches(experiment, todo, CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
+    total = max(length_hint(pending), 1)
+    stretches = _stretches(experiment, pending, CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
     with found as (client, capacity):
         yield from Dispatch(client, capacity, shared, stretches, total, experiment.noun).outcomes(progress)
 
@@ -107,14 +109,14 @@ class Dispatch:
         client: Any,
         capacity: Capacity,
         shared: Path,
-        todo: Iterable[Stretch],
+        pending: Iterable[Stretch],
         total: int,
         noun: str = "pair",
     ):
         self.client, self.capacity, self.shared, self.noun = client, capacity, shared, noun
         self.total, self.done = total, 0
         """Largest number of pairs that may come, and the number of those that were done."""
-        self.coming, self.all_came = iter(todo), False
+        self.coming, self.all_came = iter(pending), False
         """Stretches to submit after those that wait, and whether there are no more."""
         self.waiting, self.again = deque[Stretch](), deque[Stretch]()
         """Stretches to submit now, and after all others."""

@@ -31,9 +31,9 @@ from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.pair_vectors import REFUSED
+from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.rig import Prepared
 from lfpiv.runs.run import Run, open_run
-from lfpiv.runs.todo import Todo
 from lfpiv.runs.worker_plan import Plan
 from lfpiv_kernels import runtime
 
@@ -100,19 +100,19 @@ def run(
     with open_run(experiment, out, device, progress, pairs) as current:
         read = unchanged.look_at(current.experiment)
         checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
-        if checked.failed is None and checked.todo.ahead():
+        if checked.failed is None and checked.pending.ahead():
             rig.tell_vectors(current.experiment)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):
-            todo = current.unfinished(volumes=keep_volumes, quiet=True)
-            checked = _check(current, todo, workers, scheduler)
+            pending = current.unfinished(volumes=keep_volumes, quiet=True)
+            checked = _check(current, pending, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done, weights = _process(current, prepared, checked, keep_volumes)
         done, weights = _settle(current, prepared, done, weights)
         done, weights = _follow(current, prepared, done, weights)
         done = _bootstrap(current, prepared, done, weights)
-        summary = current.finish(calibrated, _with_reused(current, done, checked.todo, "vectors"), report=True)
+        summary = current.finish(calibrated, _with_reused(current, done, checked.pending, "vectors"), report=True)
         if not isinstance(experiment, Experiment):
             command: dict[str, Any] = {"experiment": str(experiment), "pairs": pairs, "device": device}
             command |= {"keep_volumes": keep_volumes, "workers": workers, "scheduler": scheduler}
@@ -148,11 +148,11 @@ def reconstruct(
         if not current.has_light_of(before):
             checked = _check(current, current.unfinished(vectors=False, volumes=True, quiet=True), 1, None)
         done = Invocation(tried=checked.failed or Tried(current.numbers))
-        if checked.failed is None and (first := checked.todo.ahead()):
+        if checked.failed is None and (first := checked.pending.ahead()):
             weights, figures = rig.build_weights(current, prepared, first)
             work = rig.pair_work(current, weights, keep_volumes=True, vectors=False, figures=figures)
-            done = Invocation(tried=_sequential(current, work, checked.todo), weights=figures)
-        return current.finish(calibrated, _with_reused(current, done, checked.todo, "volumes"), report=False)
+            done = Invocation(tried=_sequential(current, work, checked.pending), weights=figures)
+        return current.finish(calibrated, _with_reused(current, done, checked.pending, "volumes"), report=False)
 
 
 def correlate(
@@ -172,8 +172,8 @@ def correlate(
     """
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
-        todo = current.unfinished(particles=False)
-        if (known := todo.ahead()) and not current.has_some_volumes():
+        pending = current.unfinished(particles=False)
+        if (known := pending.ahead()) and not current.has_some_volumes():
             first = known[0]
             raise InputError(
                 f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
@@ -188,8 +188,8 @@ def correlate(
             rig.tell_vectors(current.experiment)
         calibration = rig.with_standing_light(current, calibrated.calibration)
         work = rig.pair_work(current, None, keep_volumes=False, calibration=calibration)
-        done = Invocation(tried=_sequential(current, work, todo))
-        return current.finish(calibrated, _with_reused(current, done, todo, "vectors"), report=False)
+        done = Invocation(tried=_sequential(current, work, pending))
+        return current.finish(calibrated, _with_reused(current, done, pending, "vectors"), report=False)
 
 
 def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, Any]:
@@ -211,22 +211,22 @@ def report(experiment: Experiment | str | Path, out: str | Path) -> dict[str, An
 class _Checked:
     """Pairs to do, after all checks."""
 
-    todo: Todo
+    pending: PendingPairs
     failed: Tried | None
     """Outcomes of all pairs if none can be done; None otherwise."""
     workers: Plan | str
     """Processes of this machine, or the address of a Dask scheduler."""
 
 
-def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None) -> _Checked:
+def _check(current: Run, pending: PendingPairs, workers: int | None, scheduler: str | None) -> _Checked:
     """Check images, memory and workers before any work, and start to preload worker processes."""
     gpus = worker_plan.visible_gpus() if current.device.kind == "cuda" else ()
-    some = bool(todo.ahead())
-    planned = worker_plan.plan(length_hint(todo), workers, current.device, gpus)
-    failed = current.check_images(todo) if some else None
+    some = bool(pending.ahead())
+    planned = worker_plan.plan(length_hint(pending), workers, current.device, gpus)
+    failed = current.check_images(pending) if some else None
     if some and failed is None:
         finest = current.reconstructed_experiment
-        needed = memory.weights_bytes(finest, current.particle_voxel) if current.need_weights(todo) else 0
+        needed = memory.weights_bytes(finest, current.particle_voxel) if current.need_weights(pending) else 0
         if workers is None:
             planned = worker_plan.fit_installation(planned, current.device)
             planned = worker_plan.fit_memory(planned, finest, needed, current.device)
@@ -237,7 +237,7 @@ def _check(current: Run, todo: Todo, workers: int | None, scheduler: str | None)
         worker_plan.require_memory(finest, needed, 1 if scheduler else planned.workers)
         if planned.workers > 1 and not scheduler:
             local_workers.start_preloading(planned.kind)
-    return _Checked(todo=todo, failed=failed, workers=scheduler or planned)
+    return _Checked(pending=pending, failed=failed, workers=scheduler or planned)
 
 
 _Weights = Callable[[], "Weights | None"]
@@ -246,21 +246,21 @@ _Weights = Callable[[], "Weights | None"]
 
 def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: bool) -> tuple[Invocation, _Weights]:
     """Do the pairs in this process or in several; the weights are built once for all of them."""
-    todo, workers = checked.todo, checked.workers
+    pending, workers = checked.pending, checked.workers
     if checked.failed is not None:
         return Invocation(tried=checked.failed), lambda: None
-    if not todo.ahead():
+    if not pending.ahead():
         return Invocation(tried=Tried(current.numbers)), lambda: None
     weights: Weights | None = None
     figures: WeightsFigures | None = None
-    if current.need_weights(todo):
-        weights, figures = rig.build_weights(current, prepared, todo.ahead())
+    if current.need_weights(pending):
+        weights, figures = rig.build_weights(current, prepared, pending.ahead())
         if isinstance(workers, Plan):
             finest = current.reconstructed_experiment
             workers = worker_plan.fit_memory(workers, finest, weights.memory_bytes, current.device)
     work = rig.pair_work(current, weights, keep_volumes=keep_volumes, calibration=prepared.calibration, figures=figures)
     if isinstance(workers, Plan) and workers.workers == 1:
-        return Invocation(tried=_sequential(current, work, todo), weights=figures), _known(weights)
+        return Invocation(tried=_sequential(current, work, pending), weights=figures), _known(weights)
     if isinstance(workers, Plan):
         used = Workers(count=workers.workers, threads=workers.threads)
     else:
@@ -270,7 +270,9 @@ def _process(current: Run, prepared: Prepared, checked: _Checked, keep_volumes: 
     del work, weights  # the workers map them from files; the memory may not have room for both
     tried = _collect(
         current,
-        dispatch.parallel(shared, current.experiment, todo, workers, current.step(current.experiment.recording.work)),
+        dispatch.parallel(
+            shared, current.experiment, pending, workers, current.step(current.experiment.recording.work)
+        ),
     )
     used = replace(used, peak_memory_mib=tried.peak_memory_mib or None)
     done = Invocation(tried=tried, weights=figures, workers=used)
@@ -337,18 +339,18 @@ class _Lazily:
         return done if self.built is None else replace(done, weights=self.built)
 
 
-def _with_reused(current: Run, done: Invocation, todo: Todo, kind: str) -> Invocation:
+def _with_reused(current: Run, done: Invocation, pending: PendingPairs, kind: str) -> Invocation:
     """Return the results of an invocation with the names of the pairs that were finished before."""
-    first, count = todo.finished
+    first, count = pending.finished
     names = tuple(f"{kind} of {current.experiment.name_of(pair)}" for pair in sorted(first))
     more = (f"{kind} of {count - len(first)} more {current.experiment.noun}s",) if count > len(first) else ()
     return replace(done, reused=names + more)
 
 
-def _sequential(current: Run, work: PairWork, todo: Todo) -> Tried:
-    if not todo.ahead():
+def _sequential(current: Run, work: PairWork, pending: PendingPairs) -> Tried:
+    if not pending.ahead():
         return Tried(current.numbers)
-    return _collect(current, dispatch.sequential(work, todo, current.step(current.experiment.recording.work)))
+    return _collect(current, dispatch.sequential(work, pending, current.step(current.experiment.recording.work)))
 
 
 def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:

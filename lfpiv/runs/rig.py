@@ -226,8 +226,8 @@ def weights_of(run: Run, calibration: Calibration, progress: StepProgress | None
     return weights
 
 
-def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[Weights, WeightsFigures]:
-    """Build the weights and check the cameras by the first pairs of `todo`."""
+def build_weights(run: Run, prepared: Prepared, pending: Sequence[int]) -> tuple[Weights, WeightsFigures]:
+    """Build the weights and check the cameras by the first pairs of `pending`."""
     from lfpiv.calibration.coverage import require_seen, warn_outside
     from lfpiv.weights.checks import compare_with_count
 
@@ -246,7 +246,7 @@ def build_weights(run: Run, prepared: Prepared, todo: Sequence[int]) -> tuple[We
         weights = weights_of(run, calibration, run.step("weights"))
         seconds = time.perf_counter() - start
         counted = compare_with_count(weights)
-        agreement = belonging.check(experiment, weights, todo)
+        agreement = belonging.check(experiment, weights, pending)
     errors = [error for camera in counted.values() for error in camera]
     if errors:  # a camera may see none of the voxels that were drawn
         share = 100 * np.mean(errors)

@@ -35,10 +35,10 @@ from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
+from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.reversed_pairs import reversed_pairs
 from lfpiv.runs.summary import Contents, EarlierSummary
-from lfpiv.runs.todo import Todo
 from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs, warn
 from lfpiv_kernels import runtime
 
@@ -213,7 +213,7 @@ class Run:
 
     def unfinished(
         self, *, vectors: bool = True, volumes: bool = False, particles: bool = True, quiet: bool = False
-    ) -> Todo:
+    ) -> PendingPairs:
         """Find the selected pairs whose results are missing or do not fit; log changes unless `quiet`."""
         self.finished.clear()
 
@@ -226,9 +226,11 @@ class Run:
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
         step = 1 if self.experiment.in_sequence else self.experiment.recording.chain or 1
-        todo = Todo(self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun)
-        todo.quiet = quiet
-        return todo
+        pending = PendingPairs(
+            self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun
+        )
+        pending.quiet = quiet
+        return pending
 
     def _keep(self, found: PairFiles) -> None:
         """Keep the figures of a pair's vectors for the summary, if they fit."""
@@ -240,18 +242,18 @@ class Run:
         stored = self.folder.stored(self.numbers, vectors=False, volumes=True)
         return any(self.has_volumes(pair) for pair, there in zip(self.numbers, stored, strict=True) if there)
 
-    def need_weights(self, todo: Todo) -> bool:
+    def need_weights(self, pending: PendingPairs) -> bool:
         """Return whether a pair to do has no volumes that fit, or particles are to be found in its images."""
-        if self.experiment.tracking is not None and todo.ahead():
+        if self.experiment.tracking is not None and pending.ahead():
             return True
-        if not all(map(self.has_volumes, todo.ahead())):
+        if not all(map(self.has_volumes, pending.ahead())):
             return True
-        if todo.whole:
+        if pending.whole:
             return False
         stored = self.folder.stored(self.numbers, vectors=False, volumes=True)
         return not all(stored) or not all(map(self.has_volumes, self.numbers))
 
-    def check_images(self, todo: Todo) -> Tried | None:
+    def check_images(self, pending: PendingPairs) -> Tried | None:
         """Check the images of the next pairs and log those that cannot be used; None if the pairs can be tried.
 
         If some pairs can be done, all are tried, and the others fail when their turn comes. If none of the pairs to do
@@ -263,10 +265,10 @@ class Run:
             If more pairs are stated than there are, or if the first pair cannot be used and no finished pair shows that
             the experiment file is right.
         """
-        known = todo.ahead()
+        known = pending.ahead()
         self._tell_missing(known)
         bad = dict(check_pairs(self.experiment, [pair for pair in known if not self.has_volumes(pair)]))
-        whole = todo.whole and len(bad) == len(known)
+        whole = pending.whole and len(bad) == len(known)
         if bad and known[0] in bad and not self._has_results():
             noun = self.experiment.noun
             others = "" if whole else f" To do the {noun}s after it, use --pairs {known[0] + 1}:."

@@ -38,16 +38,16 @@ class Stretch(NamedTuple):
     """Pairs at the seams, which can be done when this stretch and the one beyond the seam are done."""
 
 
-def cut(todo: Iterable[int], step: int | None, workers: int) -> Iterator[Stretch]:
+def cut(pending: Iterable[int], step: int | None, workers: int) -> Iterator[Stretch]:
     """Yield stretches for several processes: single pairs if `step` is None, else parts of the chains of a series.
 
-    Pairs are taken from `todo` as they are needed, in the order k, k + step, k + 2 step, ... The pairs at seams are in
-    no stretch; each is named by the two beside it.
+    Pairs are taken from `pending` as they are needed, in the order k, k + step, k + 2 step, ... The pairs at seams are
+    in no stretch; each is named by the two beside it.
     """
     if step is None:
-        yield from (Stretch((pair,)) for pair in todo)
+        yield from (Stretch((pair,)) for pair in pending)
         return
-    source = iter(todo)
+    source = iter(pending)
     most = max(min(MOST_INSTANTS, -(-length_hint(source) // (LEAST_STRETCHES * workers))), 2)
     chain, before = list[int](), list[int]()  # pairs that are not handed out yet, and the pair at the seam before them
     for pair in source:
@@ -79,14 +79,14 @@ def _stretch(chain: Sequence[int], first: int, after: int, step: int, before: Se
     return Stretch(tuple(chain[first : after - 1]), tuple(stored), (*left, *right))
 
 
-def cut_at_segments(todo: Iterable[int], step: int) -> Iterator[Stretch]:
+def cut_at_segments(pending: Iterable[int], step: int) -> Iterator[Stretch]:
     """Yield stretches of a series whose instants are reconstructed one after the other: one for each segment.
 
-    Pairs are taken from `todo` as they are needed, in ascending order. A pair between two segments is at a seam if the
-    pairs within both need its instants anyway. Otherwise it belongs to the stretch of its first instant.
+    Pairs are taken from `pending` as they are needed, in ascending order. A pair between two segments is at a seam if
+    the pairs within both need its instants anyway. Otherwise it belongs to the stretch of its first instant.
     """
     before = _Group()
-    for segment, pairs in itertools.groupby(todo, segment_of):
+    for segment, pairs in itertools.groupby(pending, segment_of):
         group = _Group.of(segment, pairs, step)
         if before.segment + 1 == segment:
             seams = {pair for pair in before.across if pair in before.instants and pair + step in group.instants}

@@ -10,8 +10,8 @@ from support.small_run import PAIRS, write_empty_report
 from lfpiv.runs import pipeline, stretches, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.pair_figures import PairFigures, Spread
+from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.run import open_run
-from lfpiv.runs.todo import Todo
 from lfpiv.warn import Code, Gathering, Warning
 
 MANY = 100_000
@@ -27,7 +27,7 @@ def make_todo(stored, changes=None, **options):
         examined.append(pair)
         return (changes or {}).get(pair)
 
-    return Todo(range(len(stored)), bytearray(stored), verify, lambda fraction: None, **options), examined
+    return PendingPairs(range(len(stored)), bytearray(stored), verify, lambda fraction: None, **options), examined
 
 
 def test_pairs_without_a_file_come_first_and_every_file_is_verified_once():
@@ -119,7 +119,7 @@ def test_memory_is_bytes_per_pair(tmp_path):
     """Figures, warnings and the search of a hundred thousand pairs, half of them finished."""
     tracemalloc.start()
     kept, found = FinishedPairs(range(MANY), tmp_path), Gathering()
-    todo = Todo(range(MANY), bytearray([0, 1]) * (MANY // 2), lambda pair: None, lambda fraction: None)
+    todo = PendingPairs(range(MANY), bytearray([0, 1]) * (MANY // 2), lambda pair: None, lambda fraction: None)
     one = figures(0.5)
     start = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()

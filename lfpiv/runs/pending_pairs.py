@@ -19,7 +19,7 @@ MOST_NAMED = 10_000
 """Largest number of finished pairs that are named one by one."""
 
 
-class Todo:
+class PendingPairs:
     """Iterator over the selected pairs whose results are missing or do not fit.
 
     `length_hint` of it is the number of pairs that may yet come.
