@@ -11,6 +11,7 @@ import importlib.util
 import json
 import logging
 import math
+import re
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
@@ -44,8 +45,8 @@ FORM = "lfpiv_store"
 """Attribute with the version of the store's layout."""
 LAYOUT = 1
 
-OLDEST_ZARR = 3
-"""Oldest major version of zarr that writes and reads stores."""
+OLDEST = {"zarr": (3, 1), "xarray": (2025, 6)}
+"""Oldest versions of the packages that write and read Zarr stores."""
 
 WRITTEN, SIGNATURE, CHANGED = "written", "signature", "file_changed_ns"
 """Attributes of a Zarr store: number of pairs that are written, and what they share. Its variable with the time of the
@@ -293,15 +294,16 @@ PAIR_TIME_ATTRIBUTES = {
 
 
 def _require_zarr() -> None:
-    try:
-        found = importlib.metadata.version("zarr")
-    except importlib.metadata.PackageNotFoundError:
-        found = "none"
-    if not found.partition(".")[0].isdecimal() or int(found.partition(".")[0]) < OLDEST_ZARR:
-        raise InputError(
-            f"zarr: expected the package zarr {OLDEST_ZARR} or newer, which needs Python 3.11, for Zarr stores, found "
-            f"{found}. `pip install 'lfpiv[zarr]'`, or export to netcdf."
-        )
+    for package, oldest in OLDEST.items():
+        try:
+            found = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found = "none"
+        if tuple(map(int, re.findall(r"\d+", found)[:2])) < oldest:
+            raise InputError(
+                f"{package}: expected the package {package} {'.'.join(map(str, oldest))} or newer, which needs Python "
+                f"3.11, for Zarr stores, found {found}. `pip install 'lfpiv[zarr]'`, or export to netcdf."
+            )
 
 
 def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray, length: int) -> tuple[int, bool]:

@@ -1,5 +1,6 @@
 """Stores of many pairs or instants: equal to the files, appended to, complete or refused, averaged in parts."""
 
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -188,6 +189,16 @@ def test_nothing_else_is_taken_for_a_store_or_removed(tmp_path):
     (tmp_path / "empty.zarr").mkdir()
     with pytest.raises(lfpiv.InputError, match=r"empty\.zarr: expected a store"):
         lfpiv.open_results(tmp_path / "empty.zarr")
+
+
+@pytest.mark.parametrize("package", ["zarr", "xarray"])
+def test_older_packages_are_named(tmp_path, monkeypatch, package):
+    write_run(tmp_path, (0,))
+    found = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "2.18.3" if name == package else found(name))
+    with pytest.raises(lfpiv.InputError, match=rf"{package}: expected .* found 2\.18\.3"):
+        lfpiv.export_results(tmp_path, "zarr")
+    assert not (tmp_path / "export").exists()
 
 
 def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form, monkeypatch):
