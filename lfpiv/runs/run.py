@@ -17,14 +17,14 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from lfpiv.errors import InputError
+from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment import recorded, recorded_times
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
-from lfpiv.results import finished, provenance, stamps, summary_file
+from lfpiv.results import provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
@@ -327,7 +327,13 @@ class Run:
         numbers = self.experiment.numbers
         stored = self.folder.stored(numbers, vectors=True, volumes=False)
         vectors = (self.folder.vectors(pair) for pair, there in zip(numbers, stored, strict=True) if there)
-        finished.require(itertools.chain([self.folder.background], vectors))
+        for path in itertools.chain([self.folder.background], vectors):
+            try:
+                provenance.require_marks(path)
+            except FileNotFoundError:
+                continue
+            except DamagedFile as error:
+                raise DamagedFile(path, error.reason, "Run `lfpiv run`, which makes it again") from None
 
     def record(self, outcome: Outcome, tried: Tried) -> None:
         """Keep the outcome of a pair and its figures. Log a failure, and rename the results from earlier images."""
