@@ -451,6 +451,24 @@ def test_fine_boards_in_focus_are_distinguished_from_chance(spacing_pitches):
     assert not on_lattice(anywhere, places, board, BIN_PITCHES * pitch)
 
 
+@pytest.mark.parametrize("dots", [(4, 6), (6, 7), (7, 7)])
+def test_misses_that_windows_and_liquids_bend_are_a_board_s(dots):
+    """Misses of the order that the number of dots determines: quadratic for 24, cubic for 42 and 49."""
+    random = np.random.default_rng(3)
+    board = DotBoard(dots=dots, spacing_mm=0.8, diameter_mm=0.1, planes_mm=(0.0,))
+    places = board.points_mm(0)[:, :2]
+    x, y = (places / np.abs(places).max(0)).T
+    bent = np.stack([x * x - y, x * y], axis=1) + (len(x) > 24) * np.stack([x**3, -x * y * y], axis=1)
+    bent *= search_radius_mm(board) / np.hypot(*bent.T).max()
+    angle, radius = (
+        2 * np.pi * random.random(len(places)),
+        search_radius_mm(board) * np.sqrt(random.random(len(places))),
+    )
+    anywhere = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert on_lattice(bent + 0.02 * random.normal(size=bent.shape), places, board, 0.035)
+    assert not on_lattice(anywhere, places, board, 0.035)
+
+
 def test_board_images_are_held_as_far_as_memory_allows():
     rng, asked = np.random.default_rng(0), []
     whole = rng.integers(0, 4096, (12, 6, 7)).astype(np.float32)

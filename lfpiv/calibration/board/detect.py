@@ -36,6 +36,7 @@ _INLIER_SPACINGS = 0.2  # largest distance of a blob from its site on the first 
 _SEARCH_SPACINGS = 0.35  # largest distance of a dot from where the pose expects it
 _JUDGED_DOTS = 6  # least number of blobs of a plane that distinguish a board from chance
 _JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
+_BLOBS_PER_TERM = 4  # least number of blobs for each term in which the misses vary beyond the first order
 _CHANCE = 0.2  # largest scatter of a board's dots about their sites [search radius],
 _CHANCE_PITCHES = 0.5  # or [microlens pitch], because a focused dot is located to a lens only
 _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
@@ -222,22 +223,36 @@ class PlaneDots:
 def find_in_planes(
     signals: Signals, rectify: Rectifier, board: DotBoard, pose: CameraPose, sign: int, optics: Optics
 ) -> tuple[list[PlaneDots], CameraPose]:
-    """Find the dots of every plane near where the pose expects them; fit the pose again after each plane."""
+    """Find the dots of every plane near where the pose expects them; fit the pose again after each plane.
+
+    Planes without dots are searched again with the pose of the others, as long as that finds dots in some.
+    """
     seen: dict[int, PlaneDots] = {}
-    for plane in planes_from_middle(board):
-        z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
-        rectified = rectify(signals.of_plane(plane), pose, z_mm)
-        blobs = _near_sites(rectified, sites[:, :2], board, sign)
-        site = np.flatnonzero(blobs.strong)
-        found = blobs.position_mm[site]
-        if not on_lattice(found - sites[site, :2], sites[site, :2], board, rectified.bin_mm):
-            site, found = site[:0], found[:0]
-        at = np.column_stack([found, np.full(len(site), z_mm)])
-        contrast = float(blobs.contrast[site].sum())
-        seen[plane] = PlaneDots(site, pose.rays(at)[0], contrast, contrast * rectified.noise)
-        points = np.concatenate([board.points_mm(p, MARGIN)[dots.site] for p, dots in seen.items()])
-        pose = pose.fitted(points, np.concatenate([dots.chief_mm for dots in seen.values()]), optics)
+    left, before = [*map(int, planes_from_middle(board))], 0
+    while len(left) != before:
+        before = len(left)
+        for plane in left:
+            seen[plane] = _dots_of_plane(signals, rectify, board, pose, plane, sign)
+            points = np.concatenate([board.points_mm(p, MARGIN)[dots.site] for p, dots in seen.items()])
+            pose = pose.fitted(points, np.concatenate([dots.chief_mm for dots in seen.values()]), optics)
+        left = [plane for plane in left if not len(seen[plane].site)]
     return [seen[plane] for plane in range(len(seen))], pose
+
+
+def _dots_of_plane(
+    signals: Signals, rectify: Rectifier, board: DotBoard, pose: CameraPose, plane: int, sign: int
+) -> PlaneDots:
+    """Find the dots of a plane near where the pose expects them; none if they are not on the board's lattice."""
+    z_mm, sites = board.planes_mm[plane], board.points_mm(plane, MARGIN)
+    rectified = rectify(signals.of_plane(plane), pose, z_mm)
+    blobs = _near_sites(rectified, sites[:, :2], board, sign)
+    site = np.flatnonzero(blobs.strong)
+    found = blobs.position_mm[site]
+    if not on_lattice(found - sites[site, :2], sites[site, :2], board, rectified.bin_mm):
+        site, found = site[:0], found[:0]
+    at = np.column_stack([found, np.full(len(site), z_mm)])
+    contrast = float(blobs.contrast[site].sum())
+    return PlaneDots(site, pose.rays(at)[0], contrast, contrast * rectified.noise)
 
 
 def _near_sites(rectified: Rectified, sites_mm: np.ndarray, board: DotBoard, sign: int) -> Blobs:
@@ -258,14 +273,16 @@ def search_radius_mm(board: DotBoard) -> float:
 def on_lattice(miss: np.ndarray, sites_mm: np.ndarray, board: DotBoard, bin_mm: float) -> bool:
     """Return whether blobs found near the expected sites are a board's dots, not chance.
 
-    The misses of a board's dots vary smoothly over the sites, here by a robust linear function. Chance spreads the
-    misses over the whole search radius. `miss` is the position of each blob minus its site, `bin_mm` the spacing of the
-    elements of the rectified image [mm].
+    The misses of a board's dots vary smoothly over the sites, here by a robust polynomial, at most cubic: windows and
+    liquids bend them beyond the first order. Chance spreads the misses over the whole search radius. `miss` is the
+    position of each blob minus its site, `bin_mm` the spacing of the elements of the rectified image [mm].
     """
     radius = search_radius_mm(board)
     if len(miss) < _JUDGED_DOTS or radius < _JUDGED_BINS * bin_mm:
         return True
-    design = np.column_stack([np.ones(len(miss)), sites_mm / board.spacing_mm])
+    x, y = sites_mm.T / board.spacing_mm
+    degree = max(d for d in (1, 2, 3) if d == 1 or len(miss) >= _BLOBS_PER_TERM * (d + 1) * (d + 2) // 2)
+    design = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = np.ones(len(miss))
     for _ in range(10):
         solution = np.linalg.lstsq(design * weight[:, None], miss * weight[:, None], rcond=None)[0]
