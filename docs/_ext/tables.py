@@ -1,7 +1,6 @@
 """Tables that cannot rot: keys of experiment and scene files, options of the command line, sentences of the warnings.
 
-`commands`, `help_text` and `warning_rows` need no Sphinx; `setup` registers the directives ``{keys}``,
-``{command}`` and ``{warning-list}``.
+`written_tables` writes keys and commands into the pages. `setup` registers the directive ``{warning-list}``.
 """
 
 from __future__ import annotations
@@ -79,26 +78,8 @@ def warning_rows() -> list[tuple[str, str]]:
 
 
 def setup(app):
-    """Register the directives."""
-    from docutils import nodes
+    """Register the directive."""
     from sphinx.util.docutils import SphinxDirective
-
-    class Keys(SphinxDirective):
-        """Table of the keys of a model."""
-
-        required_arguments = 1
-
-        def run(self):
-            return self.parse_text_to_nodes(keys_markdown(self.arguments[0]))
-
-    class Command(SphinxDirective):
-        """Help of a command."""
-
-        required_arguments = 1
-        final_argument_whitespace = True  # a command of a group has two names
-
-        def run(self):
-            return [nodes.literal_block(text := help_text(self.arguments[0]), text, language="none")]
 
     class WarningList(SphinxDirective):
         """Table of the warnings."""
@@ -106,7 +87,5 @@ def setup(app):
         def run(self):
             return self.parse_text_to_nodes(markdown_table(("code", "says"), warning_rows()))
 
-    app.add_directive("keys", Keys)
     app.add_directive("warning-list", WarningList)
-    app.add_directive("command", Command)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

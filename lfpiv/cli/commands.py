@@ -318,14 +318,15 @@ def _schema(out: Out = Path(".")) -> None:
 
     DIR/lfpiv-experiment.schema.json and DIR/lfpiv-scene.schema.json; a first line `#:schema PATH` in a file names it.
     """
+    from lfpiv.experiment.template import SCHEMA
     from lfpiv.files import write_json
     from lfpiv.settings.experiment import ExperimentTable
     from lfpiv.settings.keys import json_schema
     from lfpiv.simulation.scene import Scene
 
     written = []
-    for name, model in (("experiment", ExperimentTable), ("scene", Scene)):
-        written.append(out / f"lfpiv-{name}.schema.json")
+    for name, model in ((SCHEMA, ExperimentTable), ("lfpiv-scene.schema.json", Scene)):
+        written.append(out / name)
         out.mkdir(parents=True, exist_ok=True)
         write_json(json_schema(model), written[-1])
     _output.show(

@@ -11,12 +11,17 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from lfpiv.errors import InputError
 
+if TYPE_CHECKING:
+    from lfpiv.settings.experiment import ExperimentTable
+
+MOST_LOOKED_FOR = 2000
+"""Largest number of frames whose images are looked for."""
 MOST_PLANES = 1000
 """Largest number of planes that first, last and step may give."""
 
@@ -275,10 +280,11 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
         If the file exists, an answer is missing or wrong, or the values do not fit each other.
     """
     from lfpiv.experiment.opening import check_tables, grid_of, read_experiment
-    from lfpiv.experiment.template import Values, experiment_text
+    from lfpiv.experiment.template import SCHEMA, Values, experiment_text
     from lfpiv.experiment.toml import parse, validated
-    from lfpiv.files import write_text
+    from lfpiv.files import write_json, write_text
     from lfpiv.settings.experiment import ExperimentTable
+    from lfpiv.settings.keys import json_schema
     from lfpiv.velocity import vector_grid
 
     if path.exists():
@@ -292,16 +298,38 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(text, path)
+        write_json(json_schema(ExperimentTable), path.parent / SCHEMA)
     except OSError as error:
         raise InputError(f"{path}: the file cannot be written ({error.strerror}). Name another folder.") from None
     missing = ""
     try:
         read_experiment(path)
     except InputError as error:
-        missing = str(error)
+        missing = _missing_images(path, table) or str(error)
     vectors = vector_grid.sentence(table.correlation, grid.shape, grid.voxel_mm)
     warnings = vector_grid.warnings(table.correlation, grid.shape)
     return Written(missing, vectors, tuple(warning.sentence for warning in warnings))
+
+
+def _missing_images(path: Path, table: ExperimentTable) -> str:
+    """Name all images that a new file states and that are not there, those of a camera's board or pairs together."""
+    from lfpiv.experiment.readers.source import split
+    from lfpiv.experiment.recording import Recording
+
+    recording, planes = Recording.of_table(table.particles), range(len(table.board.planes_mm))
+    frames = [recording.frame(number).fields for number in recording.frames[:MOST_LOOKED_FOR]]
+    groups = [[camera.white_image] for camera in table.camera]
+    for pattern, fields in (
+        (table.board.images, [{"plane": plane} for plane in planes]),
+        (table.particles.images, frames),
+    ):
+        groups += [[pattern.format(camera=camera.name, **one) for one in fields] for camera in table.camera]
+    found = []
+    for group in groups:
+        lacking = [name for name in dict.fromkeys(group) if not split(path.parent / name).file.is_file()]
+        if lacking:
+            found.append(lacking[0] if len(lacking) == 1 else f"{lacking[0]} to {lacking[-1]} ({len(lacking)} images)")
+    return f"no such files: {', '.join(found)}" if found else ""
 
 
 def _answers(given: Mapping[str, str | None], path: Path) -> dict[str, Any]:

@@ -203,7 +203,8 @@ def print_init(experiment: Path, written: Written) -> None:
         say(f"warning: {text}")
     if written.missing:
         say(f"not complete yet: {written.missing}")
-    say(f"next: lfpiv run {experiment} --out results")
+    say(f"next: lfpiv check {experiment} --out results, which shows the axes, or lfpiv studio {experiment}")
+    say(f"then: lfpiv run {experiment} --out results")
 
 
 def print_check(found: dict[str, Any]) -> None:

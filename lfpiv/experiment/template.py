@@ -27,6 +27,8 @@ from lfpiv.settings.bounds import (
 from lfpiv.settings.rig import Dots, Flip
 from lfpiv.settings.table import Table
 
+SCHEMA = "lfpiv-experiment.schema.json"
+"""Name of the JSON Schema of experiment files beside a new file, by which editors complete and check it."""
 COMMENT_COLUMN = 45
 """Column at which comments begin."""
 
@@ -71,6 +73,7 @@ def experiment_text(values: Values) -> str:
 def _head(values: Values) -> str:
     return "\n".join(
         [
+            f"#:schema ./{SCHEMA}",
             "# Experiment of lfpiv. Lengths are in mm, times in s, angles in degrees. Paths are relative to this file.",
             "# z is the depth axis, from the volume towards the cameras, y points up, x to the right; the origin is",
             "# where the cameras' axes meet. A line that begins with '# ' and a key shows an optional key.",

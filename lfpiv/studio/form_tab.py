@@ -120,7 +120,7 @@ class Form:
             with html.Div(classes="lf-bar"):
                 controls.choice("x_open", "experiment file", ("x_files",), id="x-open", classes="lf-wide")
                 controls.button("Save", (edit, "['save']"), "mdi-content-save", disabled=("!x_changed",), id="x-save")
-                controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",))
+                controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",), id="x-undo")
                 controls.button("Add a camera", (edit, "['camera']"), "mdi-camera-plus")
             html.Div("{{ x_wrong[''] }}", v_if="x_wrong['']", classes="lf-wrong", role="alert")
             html.Div("{{ x_checked }}", v_if="x_checked", classes="lf-note", role="status")

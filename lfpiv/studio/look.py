@@ -95,7 +95,7 @@ class Picture:
         ink, paint = INK[look.theme], {"cmap": look.colours, "clim": list(limits), "scalars": look.colour}
         shade = (look.colour, look.colours, limits, look.theme, title)
         bar = {
-            "title": title, "color": ink, "vertical": True, "fmt": "%.3g", "position_x": 0.9, "position_y": 0.2,
+            "title": title, "color": ink, "vertical": True, "fmt": "%.3g", "position_x": 0.86, "position_y": 0.2,
             "width": 0.05, "height": 0.6, "n_labels": 5, "title_font_size": 15, "label_font_size": 13,
             "unconstrained_font_size": True,
         }  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,8 @@ TABS = {
 """Name of a tab -> its title, and the module that builds it."""
 
 ENCODED_S = 0.01
-"""Time after which the server looks for an encoded picture again, longer by as much each time [s]."""
-MOST_LOOKS = 60
+"""Time after which the server looks for an encoded picture again [s]."""
+MOST_LOOKS = 500
 """Number of looks until the server takes a picture for lost."""
 
 
@@ -62,11 +64,19 @@ def build(given: Path) -> Session:
 
 
 def _deliver_soon(protocol: Any) -> None:
-    """Send a picture as soon as it is encoded. trame-vtk looks again half a second later otherwise."""
+    """Send a picture as soon as it is encoded. trame-vtk looks again once, after half a second."""
     for part in protocol.getLinkProtocols():
-        if hasattr(part, "delta_stale_time_before_render"):
+        if hasattr(part, "render_stale_image"):
             part.delta_stale_time_before_render = ENCODED_S
-            part.stale_count_limit = MOST_LOOKS
+            part.render_stale_image = functools.partial(_look_again, part)
+
+
+def _look_again(part: Any, view: str, looks: int = 0) -> None:
+    """Send the picture of a view if it is encoded by now; look again otherwise."""
+    if part.stale_handler_count.get(view, 0) > 0:
+        part.stale_handler_count[view] -= 1
+        if part.last_stale_time.get(view) and looks < MOST_LOOKS:
+            part.push_render(view, False, looks + 1)
 
 
 def routes(session: Session) -> list[web.RouteDef]:
@@ -96,11 +106,15 @@ def _open(session: Session, given: Path) -> None:
         session.experiment = given
     elif is_store(given) or _is_run(given):
         session.results = given
-    experiments, results = session.places.experiments(), session.places.results()
-    if session.experiment is None and len(experiments) == 1:
-        session.experiment = experiments[0]
-    if session.results is None and results:
-        session.results = results[0]
+    if session.experiment is None:
+        session.experiment = _nearest(session.places.experiments(), session.results or given)
+    if session.results is None:
+        session.results = _nearest(session.places.results(), session.experiment or given)
+
+
+def _nearest(found: list[Path], other: Path) -> Path | None:
+    """Return the path that shares most folders with another one; None where there is none."""
+    return max(found, key=lambda path: len(os.path.commonpath([path, other])), default=None)
 
 
 def _bar(session: Session) -> None:

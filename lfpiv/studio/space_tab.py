@@ -37,8 +37,7 @@ class Space:
         self.placed, self.views, self.dragged = False, [], False  # type: tuple[bool, list[Any], bool]
         self.shapes: dict[str, tuple[int, int]] = {}
         self.state.update(
-            {"s_seen": False, "s_board": True, "s_cameras": True, "s_drag": "volume", "s_drags": [], "s_facts": [],
-             "s_solids": []}
+            {"s_seen": False, "s_board": True, "s_cameras": True, "s_drag": "volume", "s_drags": [], "s_facts": []}
         )  # fmt: skip
         self.state.change("s_seen", "s_board", "s_cameras", "s_drag", "theme")(lambda **_: session.guarded(self.draw)())
         self.state.change("tab")(lambda tab, **_: tab == "space" and session.guarded(self.draw)())
@@ -83,8 +82,8 @@ class Space:
             colour = COLOURS[number % len(COLOURS)]
             if s.s_cameras:
                 p.add_mesh(rig_space.pyramid(pupil, corners, length), color=colour, line_width=2, render=False)
-                p.add_mesh(rig_space.body(pupil, length, 0.25 * length), color=colour, render=False)
-                place = pupil / np.linalg.norm(pupil) * min(1.2 * length, float(np.linalg.norm(pupil)))
+                p.add_mesh(rig_space.body(pupil, length, 0.14 * length), color=colour, render=False)
+                place = pupil / np.linalg.norm(pupil) * min(1.3 * length, float(np.linalg.norm(pupil)))
                 p.add_point_labels([place], [camera["name"]], text_color=colour, shape=None, font_size=14, render=False)
         if s.s_board:
             for z_mm in values["board"]["planes_mm"]:
@@ -111,10 +110,8 @@ class Space:
         p.add_axes(color=ink)
         self._handles(solids, box, centre, size)
         if not self.placed:
-            p.camera_position = "xy"
-            p.camera.azimuth, p.camera.elevation = 30.0, 25.0
-            p.reset_camera(render=False)
             self.placed = True
+            self._turn("volume", box)
         s.s_facts = facts
         names = [f"solid {number}: {solid['kind'].replace('_', ' ')}" for number, solid in enumerate(solids)]
         s.s_drags = [
@@ -207,10 +204,21 @@ class Space:
             self.draw()
 
     def look_along(self, name: str) -> None:
-        """Look from a side."""
-        self.plotter.camera_position = {"x": "yz", "y": "xz", "z": "xy"}[name]
-        self.plotter.reset_camera(render=False)
+        """Look from a side, or obliquely at the volume or the whole rig."""
+        volume = self.session.draft.values["volume"] if self.session.draft is not None else {}
+        centre, size = (np.asarray(volume[key], float) for key in ("centre_mm", "size_mm"))
+        self._turn(name, np.column_stack([centre - size / 2, centre + size / 2]).ravel())
         self.view.update()
+
+    def _turn(self, name: str, box: np.ndarray) -> None:
+        """Turn the camera to a view; of the sides and "volume" the box is seen closely."""
+        p = self.plotter
+        p.camera_position = {"x": "yz", "y": "xz"}.get(name, "xy")
+        if name in ("volume", "rig"):
+            p.camera.azimuth, p.camera.elevation = 30.0, 35.0
+        middle = (box[::2] + box[1::2]) / 2
+        p.reset_camera(bounds=None if name == "rig" else np.repeat(middle, 2) + 1.3 * (box - np.repeat(middle, 2)))
+        p.renderer.ResetCameraClippingRange()
 
     # -- page ---------------------------------------------------------------------------------------------------------
 
@@ -233,8 +241,9 @@ class Space:
                          "them; distances beyond the volume are shortened.", classes="lf-note")  # fmt: skip
                 html.H3("View")
                 with html.Div(classes="lf-buttons"):
-                    for name in "xyz":
-                        controls.button(f"along {name}", (guarded(self.look_along), f"['{name}']"))
+                    for name in ("volume", "rig", "x", "y", "z"):
+                        text = f"along {name}" if len(name) == 1 else name
+                        controls.button(text, (guarded(self.look_along), f"['{name}']"), id=f"s-look-{name}")
             with html.Div(classes="lf-main"), html.Div(classes="lf-view", id="s-view"):
                 self.view = vtk_widgets.VtkRemoteView(
                     self.plotter.render_window, ref="space", interactive_ratio=0.7, interactive_quality=70

@@ -1,6 +1,7 @@
 """`lfpiv init`: a commented experiment file by options or by questions, valid before any image exists."""
 
 import io
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -46,7 +47,12 @@ def test_options_give_a_valid_commented_file(tmp_path, capfd):
     path = tmp_path / "jet" / "experiment.toml"
     assert call(path, *EXAMPLE) == 0
     shown = capfd.readouterr().out
-    assert f"experiment: {path}" in shown and "white/left.tif" in shown and f"lfpiv run {path}" in shown
+    assert f"experiment: {path}" in shown and f"lfpiv check {path}" in shown and f"lfpiv run {path}" in shown
+    missing = next(line for line in shown.splitlines() if line.startswith("not complete yet"))
+    for name in ("white/left.tif", "white/right.tif", "board/right/plane_00.tif", "plane_08.tif (9 images)"):
+        assert name in missing
+    schema = json.loads((path.parent / "lfpiv-experiment.schema.json").read_text("utf-8"))
+    assert "./lfpiv-experiment.schema.json" in path.read_text("utf-8").splitlines()[0] and schema["properties"]["dt_s"]
     table = read_toml(path, ExperimentTable)
     assert [(camera.name, camera.nominal_angle_deg) for camera in table.camera] == [("left", 45.0), ("right", -45.0)]
     assert table.name == "jet" and table.dt_s == 1e-4 and table.particles.pairs == 100

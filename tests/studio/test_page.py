@@ -1,0 +1,138 @@
+"""The page as a person uses it in Chromium: pointer, handles, keyboard, a series that plays, a run that is stopped."""
+
+import time
+
+import pytest
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from support.studio_page import served, until
+
+pytestmark = pytest.mark.browser
+
+FIRST_S, RUN_S = 60, 120
+"""Longest time until images are decoded, and until a run has begun or ended [s]."""
+SETTLED_S = 0.5
+"""Time until a view has turned [s]."""
+PLACES = [(dx, dy) for dx in (60, 120, -60, 0, -120) for dy in (150, 190, 110, 230)]
+"""Places beside the middle of the view where a handle may be taken [pixel]."""
+
+
+@pytest.fixture(scope="module")
+def page(small_run, tmp_path_factory, browser):
+    """Open the studio on a small experiment and its results."""
+    folder = tmp_path_factory.mktemp("page") / "rig"
+    small_run.results(small_run.images(folder).parent / "results")
+    with served(folder) as address:
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape(1440, 900))
+        browser.get(address)
+        until(
+            lambda: browser.execute_script("return !!(window.trame && trame.state && trame.state.get('tab'))"), FIRST_S
+        )
+        yield Page(browser, folder)
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def shape(width, height):
+    return {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+
+
+class Page:
+    """The page, its state and its parts."""
+
+    def __init__(self, browser, folder):
+        self.browser, self.folder = browser, folder
+
+    def get(self, name):
+        return self.browser.execute_script(f"return trame.state.get('{name}')")
+
+    def open(self, tab):
+        self.browser.execute_script(f"trame.state.set('tab', '{tab}')")
+        until(lambda: self.find(f"tab-{tab}").is_displayed())
+
+    def find(self, name):
+        return self.browser.find_element("id", name)
+
+    def click(self, name):
+        self.browser.execute_script("arguments[0].scrollIntoView()", self.find(name))
+        self.find(name).click()
+
+
+def test_the_view_through_the_pupil_follows_the_pointer(page):
+    page.open("images")
+    until(lambda: page.get("i_pupil") and not page.get("i_busy"), FIRST_S)
+    before = page.get("i_pupil")["url"]
+    picture = page.browser.find_element("css selector", "#tab-images .lf-image canvas")
+    ActionChains(page.browser).move_to_element_with_offset(picture, 3, 2).move_by_offset(5, 3).perform()
+    until(lambda: page.get("i_pupil")["url"] != before)
+    assert "column" in page.browser.find_element("class name", "lf-readout").text
+    assert {mark["kind"] for mark in page.get("i_marks")} >= {"circles", "arrows"}
+
+
+def test_a_wall_is_dragged_and_its_numbers_reach_the_form(page):
+    page.open("space")
+    page.click("s-wall")
+    point = "volume.solid.0.point_mm"
+    before = until(lambda: page.get("x_texts").get(point))
+    view = page.find("s-view")
+    until(lambda: page.browser.execute_script("return !!document.querySelector('#s-view img')?.naturalWidth"), FIRST_S)
+    for dx, dy in PLACES:
+        page.click("s-look-volume")
+        time.sleep(SETTLED_S)
+        hold = ActionChains(page.browser).move_to_element_with_offset(view, dx, dy).click_and_hold()
+        hold.move_by_offset(0, -20).pause(0.1).move_by_offset(0, -20).pause(0.1).release().perform()
+        if page.get("x_texts")[point] != before:
+            break
+    until(lambda: page.get("x_texts")[point] != before, 5)
+    page.open("experiment")
+    assert f"+point_mm = {page.get('x_texts')[point]}" in page.get("x_diff")
+    page.browser.execute_script("arguments[0].click()", page.find("x-undo"))
+    until(lambda: point not in page.get("x_texts"))
+
+
+def test_a_mistake_is_told_as_one_types_and_the_keyboard_saves(page):
+    page.open("experiment")
+    page.browser.execute_script("trame.state.set('x_shown', [0])")
+    field = until(lambda: page.find("x-dt_s") if page.browser.find_elements("id", "x-dt_s") else None)
+    until(field.is_displayed)
+    field.send_keys(Keys.CONTROL + "a")
+    field.send_keys("-1")
+    until(lambda: "expected a number above 0" in page.get("x_wrong").get("dt_s", ""))
+    field.send_keys(Keys.CONTROL + "a")
+    field.send_keys("0.002")
+    until(lambda: not page.get("x_wrong") and page.get("x_changed"))
+    page.find("x-save").send_keys(Keys.ENTER)
+    until(lambda: not page.get("x_changed"))
+    assert "dt_s = 0.002" in (page.folder / "experiment.toml").read_text("utf-8")
+
+
+def test_a_series_plays_and_stops(page):
+    page.open("results")
+    page.click("r-play")
+    seen = set()
+    until(lambda: seen.add(page.get("r_step")) or len(seen) > 2)
+    page.click("r-play")
+    until(lambda: not page.get("r_playing"))
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_narrow_page_has_no_part_beside_it(page, theme):
+    page.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape(390, 844))
+    try:
+        page.browser.execute_script(f"trame.state.set('theme', '{theme}')")
+        for tab in ("images", "experiment", "space", "preview", "runs", "results"):
+            page.open(tab)
+            wide = page.browser.execute_script(f"return document.getElementById('tab-{tab}').scrollWidth")
+            assert wide <= 390, tab
+        until(lambda: page.browser.execute_script(f"return !!document.querySelector('.v-theme--{theme}')"))
+    finally:
+        page.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", shape(1440, 900))
+
+
+def test_a_run_is_started_and_stopped(page):
+    page.open("runs")
+    page.browser.execute_script("trame.state.set('p_out', 'again')")
+    page.click("p-start")
+    until(lambda: page.get("p_status") == "running" and page.get("p_log"), RUN_S)
+    page.click("p-stop")
+    until(lambda: page.get("p_status") not in ("running", "paused"), RUN_S)
+    assert "lfpiv run" in page.get("p_log") and not (page.folder / "again" / ".lock").exists()
