@@ -10,10 +10,12 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from support.small_run import PAIRS, same_vectors
 
 from lfpiv import hdf5
 from lfpiv.cli import commands
 from lfpiv.runs import pipeline, unchanged
+from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.runs.run import open_run
 
 
@@ -26,6 +28,18 @@ def run(experiment, out, *more):
 def finished(small_run, tmp_path):
     """Return experiment file and results of a finished run, as copies."""
     return small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_a_lost_volume_of_an_image_pair_is_reconstructed_by_itself(small_run, tmp_path, monkeypatch):
+    out, found, frame = small_run.results(tmp_path / "out"), [], Reconstructor.frame
+    for lost in ("volumes/pair_0001_b.nc", "vectors/pair_0001.nc"):
+        (out / lost).unlink()
+    monkeypatch.setattr(
+        Reconstructor, "frame", lambda self, light, step: found.append(light.frame.label) or frame(self, light, step)
+    )
+    pipeline.run(small_run.experiment, out, keep_volumes=True)
+    assert found == ["pair 1, frame b"] and same_vectors(small_run.out, out) == PAIRS
 
 
 @pytest.mark.slow
