@@ -1,7 +1,7 @@
 """Plots of the page on accuracy, drawn from stored figures in the colours of the page, light or dark.
 
-`draw` needs no Sphinx; `setup` registers the directive ``{accuracy-plot} NAME``. `perf/accuracy/headlines.py` and
-`perf/accuracy/method_comparison.py` write the figures.
+`draw` needs no Sphinx; `setup` registers the directive ``{accuracy-plot} NAME``. `perf/accuracy/headlines.py`,
+`method_comparison.py` and `resolution.py` write the figures.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from side_by_side import FIGURES as METHODS
 from lfpiv.report import svg
 
 FIGURES = METHODS.with_name("accuracy.json")
+RESOLUTION = METHODS.with_name("resolution.json")
 OURS, TRUTH, BEFORE, PAPER = svg.SERIES[0], svg.INK, svg.SERIES[2], svg.SERIES[1]
 AXIS_COLOURS = dict(zip("xyz", svg.SERIES, strict=False))
 HEIGHT_INCH = 2.7
@@ -25,9 +26,10 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def stored_figures() -> dict[str, Any]:
-    """Return the figures of both files."""
+    """Return the figures of all files."""
     figures: dict[str, Any] = json.loads(FIGURES.read_text("utf-8"))
-    return figures | {"methods": json.loads(METHODS.read_text("utf-8"))["seeding"]}
+    response = json.loads(RESOLUTION.read_text("utf-8"))["response"]
+    return figures | {"methods": json.loads(METHODS.read_text("utf-8"))["seeding"], "response": response}
 
 
 def draw(name: str, stored: Mapping[str, Any]) -> str:
@@ -146,6 +148,33 @@ def stated_uncertainty(axes: Axes, stored: Mapping[str, Any]) -> str:
     return "True rms error against the stated uncertainty"
 
 
+def response_across(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the response to waves of the displacement across the view."""
+    return _response(axes, stored, "y", "across the view")
+
+
+def response_in_depth(axes: Axes, stored: Mapping[str, Any]) -> str:
+    """Draw the response to waves of the displacement in depth."""
+    return _response(axes, stored, "z", "in depth")
+
+
+def _response(axes: Axes, stored: Mapping[str, Any], axis: str, where: str) -> str:
+    rows: Rows = stored["response"]
+    waves = [row["wave"] for row in rows]
+    styles = {
+        "joint field": (OURS, "-"),
+        "joint vectors": (svg.SERIES[2], "-"),
+        "correlation": (svg.SERIES[1], "-"),
+        "true particles": (TRUTH, ":"),
+    }
+    for way, (colour, style) in styles.items():
+        _line(axes, waves, [row[way][axis] for row in rows], colour, way, style)
+    axes.axhline(0.5, color=TRUTH, lw=0.6)
+    _finish(axes, f"response {where}", "wavelength [voxel]", "measured / true amplitude", log_x=waves)
+    axes.set_ylim(-0.2, 1.2)
+    return f"Measured over true amplitude of waves of the displacement {where}, against their length"
+
+
 PLOTS = {
     "seeding": error_against_seeding,
     "quality": quality_against_seeding,
@@ -155,10 +184,14 @@ PLOTS = {
     "window": error_against_window,
     "weights": weights_error,
     "uncertainty": stated_uncertainty,
+    "response": response_across,
+    "response-depth": response_in_depth,
 }
 """Plots by name."""
 
 
 def setup(app):
     """Register the directive."""
-    return add_directive(app, "accuracy-plot", lambda name: draw(name, stored_figures()), PLOTS, (FIGURES, METHODS))
+    return add_directive(
+        app, "accuracy-plot", lambda name: draw(name, stored_figures()), PLOTS, (FIGURES, METHODS, RESOLUTION)
+    )

@@ -22,6 +22,7 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.joint.fit import JointFit, fit_pair
 from lfpiv.joint.model import JointModel
+from lfpiv.joint.spline_field import SPACING_VOXEL
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings
@@ -49,6 +50,7 @@ class Estimate(enum.Enum):
 
     ALONE = "each frame reconstructed by itself"
     JOINT = "both frames fitted together with the displacement"
+    TOO_THIN = "the volume is thinner than the distance of the displacement's nodes, 8 reconstructed voxels"
     NOT_STARTED = "too few valid vectors to start a joint fit: look at windows, seeding and displacements"
 
 
@@ -167,8 +169,10 @@ class PairSolver:
     def _joint(
         self, prepared: Sequence[PreparedFrame], alone: PairResult, progress: Callable[[float], None]
     ) -> PairResult:
-        """Return the joint fit that starts from the frames by themselves, or these if they show too few vectors."""
+        """Return the joint fit that starts from the frames by themselves, or these if it cannot be better."""
         weights = self.smart.weights
+        if min(weights.grid.shape) < SPACING_VOXEL:
+            return replace(alone, estimate=Estimate.TOO_THIN)
         volumes = [volume_on(frame.to_dataarray(), weights.volume) for frame in alone.frames]
         with collected(quiet=True):
             vectors = correlate(*volumes, **self.correlation)

@@ -1,6 +1,6 @@
 """Response of the vectors to waves of each length: the smallest structure that the correlation and the joint fit show.
 
-    python perf/accuracy/resolution.py --waves 8 12 16 20 24 32 --seeds 1 2
+    python perf/accuracy/resolution.py --out docs/figures/resolution.json
 
 A transverse wave along x moves particles along y, across the view, and along z, in depth. The response is the slope of
 the measured on the true displacement at the centres of the windows, or at the voxels for the field of the joint fit,
@@ -10,6 +10,8 @@ away from the faces. "true" is the correlation of the true volumes: what the win
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -22,6 +24,7 @@ from lfpiv.settings.processing import Correlation
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.settings import cut_windows
 
+WAYS = ("correlation", "true particles", "joint vectors", "joint field")
 FACE_MM = 0.6
 """Distance from the faces that is left out: half of the last window."""
 
@@ -63,17 +66,25 @@ def responses(name: str) -> np.ndarray:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--waves", nargs="+", type=int, default=[8, 10, 12, 16, 20, 24, 32])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--waves", nargs="+", type=int, default=[10, 12, 14, 16, 20, 24, 32])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--ppm", type=float, default=0.5)
-    arguments = parser.parse_args()
-    print(
-        "| wave [voxel] | correlation y, z | true y, z | joint vectors y, z | joint field y, z |\n|---|---|---|---|---|"
-    )
+    parser.add_argument("--out", type=Path, help="JSON file for the plot of docs/accuracy.md")
+    arguments, rows = parser.parse_args(), []
+    print(f"| wave [voxel] | {' | '.join(f'{way} y, z' for way in WAYS)} |\n|---|---|---|---|---|")
     for wave in arguments.waves:
         found = np.array([responses(f"wave{wave}:{arguments.ppm}:{seed}:2") for seed in arguments.seeds])
-        mean, spread = found.mean(0), found.std(0)
+        mean, error = found.mean(0), found.std(0, ddof=1) / len(found) ** 0.5
         cells = [
-            " ".join(f"{m:.2f} ± {s:.2f}" for m, s in zip(*row, strict=True)) for row in zip(mean, spread, strict=True)
+            " ".join(f"{m:.2f} ± {e:.2f}" for m, e in zip(*row, strict=True)) for row in zip(mean, error, strict=True)
         ]
         print(f"| {wave} | {' | '.join(cells)} |", flush=True)
+        both = np.stack([mean, error], -1).round(4)
+        rows.append(
+            {"wave": wave}
+            | {way: dict(zip("yz", one.tolist(), strict=True)) for way, one in zip(WAYS, both, strict=True)}
+        )
+    if arguments.out is not None:
+        arguments.out.write_text(
+            json.dumps({"ppm": arguments.ppm, "seeds": arguments.seeds, "response": rows}, indent=1)
+        )
