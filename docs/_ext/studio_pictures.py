@@ -1,7 +1,7 @@
 """Take the pictures of the studio that the pages show: ``python docs/_ext/studio_pictures.py FOLDER``.
 
-FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. Each tab is seen by headless Chromium,
-1440 pixels wide in light and dark, and 390 pixels wide in light.
+FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. A run into a folder "again" is
+begun. Each tab is seen by headless Chromium, 1440 pixels wide in light and dark, and 390 pixels wide in light.
 """
 
 import shutil
@@ -21,11 +21,13 @@ TABS = {
     "experiment": ("x_tables", {"x_shown": [1]}),
     "space": ("s_facts", {"s_seen": True}),
     "preview": ("t_voxels", {}),
-    "runs": ("p_status", {}),
+    "runs": ("p_status", {"p_out": "again"}),
     "results": ("r_chart", {"r_arrows": True}),
 }
 """Name of a tab -> a value of the state that is there when it is drawn, and values that are set for the picture."""
-LONGEST_S, SETTLED_S = 120.0, 4.0
+CLICKED = {"preview": ("t-try", "t_after"), "runs": ("p-start", "p_stages")}
+"""Name of a tab -> a button that is clicked at first, and a value of the state that is there after that."""
+LONGEST_S, SETTLED_S = 150.0, 4.0
 """Longest time until a tab is drawn, and time after that until its picture is taken [s]."""
 
 
@@ -60,10 +62,14 @@ def see(driver: webdriver.Chrome, address: str) -> None:
         wait(driver, "return !!(window.trame && trame.state && trame.state.get('tab'))")
         for tab, (ready, values) in TABS.items():
             for theme in ("light", "dark") if size == "wide" else ("light",):
-                driver.execute_script(f"trame.state.set('theme', '{theme}'); trame.state.set('tab', '{tab}')")
-                wait(driver, f"const v = trame.state.get('{ready}'); return !!v && v.length !== 0")
+                opened = f"trame.state.set('theme', '{theme}'); trame.state.set('tab', '{tab}')"
+                wait(driver, f"{opened}; const v = trame.state.get('{ready}'); return !!v && v.length !== 0")
                 for name, value in values.items():
                     driver.execute_script("trame.state.set(arguments[0], arguments[1])", name, value)
+                button, shown = CLICKED.get(tab, ("", ""))
+                if button and not driver.execute_script(f"return (trame.state.get('{shown}') || []).length"):
+                    driver.find_element("id", button).click()
+                    wait(driver, f"return trame.state.get('{shown}').length > 0")
                 time.sleep(SETTLED_S)
                 driver.save_screenshot(str(OUT / f"{tab}_{size}_{theme}.png"))
 

@@ -72,15 +72,8 @@ class Draft:
         if value is None:
             if key in table:
                 del table[key]
-        elif key in table and not isinstance(value, list | dict):
-            comment = table[key].trivia if hasattr(table[key], "trivia") else None
-            item = tomlkit.item(value)
-            if comment is not None:
-                item.trivia.comment_ws, item.trivia.comment = comment.comment_ws, comment.comment
-            table[key] = item
         else:
-            old = table[key] if key in table else None
-            item = tomlkit.item(value)
+            item, old = tomlkit.item(value), table[key] if key in table else None
             if old is not None and hasattr(old, "trivia") and hasattr(item, "trivia"):
                 item.trivia.comment_ws, item.trivia.comment = old.trivia.comment_ws, old.trivia.comment
             table[key] = item
@@ -180,14 +173,12 @@ class Draft:
 
     def texts(self) -> dict[str, str]:
         """Return the text of each value by its dotted name; "" where the file does not state it."""
-        return {row["id"]: self.shown(row["id"], row["plain"]) for table in self.tables() for row in table["rows"]}
-
-    def shown(self, name: str, plain: bool) -> str:
-        """Return the text of a value as a person types it."""
-        value = self.get(location_of(name))
-        if value is None:
-            return ""
-        return str(value) if plain or isinstance(value, str) else tomlkit.item(value).as_string().strip()
+        texts = {}
+        for row in (row for table in self.tables() for row in table["rows"]):
+            value = self.get(location_of(row["id"]))
+            plain = row["plain"] or isinstance(value, str)
+            texts[row["id"]] = "" if value is None else str(value) if plain else tomlkit.item(value).as_string().strip()
+        return texts
 
 
 def dotted(location: Sequence[int | str]) -> str:

@@ -17,11 +17,6 @@ WRITE = "x_texts = {...x_texts, [row.id]: $event.target.value}; trigger('x_write
 """What the page does when a field changes."""
 
 
-def build(session: Session) -> None:
-    """Build the tab."""
-    Form(session)
-
-
 class Form:
     """State and page of the tab."""
 

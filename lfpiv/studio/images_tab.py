@@ -26,11 +26,6 @@ class Picture(AbstractElement):  # type: ignore[misc]  # trame has no types
         self._event_names += ["point", "pick"]
 
 
-def build(session: Session) -> None:
-    """Build the tab."""
-    Images(session)
-
-
 class Images:
     """State and panel of the tab."""
 

@@ -8,9 +8,6 @@ import xarray as xr
 
 import lfpiv
 
-SEEDS_RADIUS = 0.45
-"""Radius of the ball in which streamlines start, as a share of the volume's diagonal."""
-
 
 def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
     """Return the vectors of one pair or instant, or a statistic over all of them: "mean" or "fluctuations"."""

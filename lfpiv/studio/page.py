@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +15,24 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
-from lfpiv.studio import form_tab, images_tab, preview_tab, results_tab, runs_tab, space_tab
 from lfpiv.studio.access import Places
+from lfpiv.studio.form_tab import Form
+from lfpiv.studio.images_tab import Images
+from lfpiv.studio.preview_tab import Preview
+from lfpiv.studio.results_tab import Results
+from lfpiv.studio.runs_tab import Runs
 from lfpiv.studio.session import Session
+from lfpiv.studio.space_tab import Space
 
-TABS = {
-    "images": ("Rig and images", images_tab),
-    "experiment": ("Experiment", form_tab),
-    "space": ("Space", space_tab),
-    "preview": ("Preview", preview_tab),
-    "runs": ("Runs", runs_tab),
-    "results": ("Results", results_tab),
+TABS: dict[str, tuple[str, Callable[[Session], Any]]] = {
+    "images": ("Rig and images", Images),
+    "experiment": ("Experiment", Form),
+    "space": ("Space", Space),
+    "preview": ("Preview", Preview),
+    "runs": ("Runs", Runs),
+    "results": ("Results", Results),
 }
-"""Name of a tab -> its title, and the module that builds it."""
+"""Name of a tab -> its title, and the class that builds it."""
 
 ENCODED_S = 0.01
 """Time after which the server looks for an encoded picture again [s]."""
@@ -50,9 +56,9 @@ def build(given: Path) -> Session:
     with VAppLayout(server, theme=("theme",)):
         _bar(session)
         with v3.VMain():
-            for name, (_, module) in TABS.items():
+            for name, (_, tab) in TABS.items():
                 with html.Div(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
-                    module.build(session)
+                    tab(session)
         v3.VSnackbar(
             "{{ message }}", v_model=("message_shown",), timeout=15000, multi_line=True, location="top", color="error",
             classes="lf-message",

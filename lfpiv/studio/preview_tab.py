@@ -40,11 +40,6 @@ SLIDERS = (
 """Key, label, range, step and first value of each slider."""
 
 
-def build(session: Session) -> None:
-    """Build the tab."""
-    Preview(session)
-
-
 def state_of(key: str) -> str:
     """Return the name in the state of a slider's value."""
     return "t_" + key.replace(".", "_")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import csv
-import io
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from trame.widgets import vuetify3 as v3
 
 import lfpiv
 from lfpiv.errors import InputError
+from lfpiv.results import tables
 from lfpiv.studio import charts, controls, layers, look
 from lfpiv.studio.session import Session
 
@@ -35,11 +34,6 @@ COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
 FRAMES_PER_S = 8
 """Pictures of a film per second of a series; a turn takes 60 pictures at three times the rate."""
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "oblique"}
-
-
-def build(session: Session) -> None:
-    """Build the tab."""
-    Results(session)
 
 
 class Results:
@@ -61,7 +55,7 @@ class Results:
                 "r_every": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
                 "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
                 "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
-                "r_script": "", "r_script_shown": False, "r_moments_ms": 0,
+                "r_script": "", "r_script_shown": False,
             }
         )  # fmt: skip
         watched = """
@@ -71,7 +65,7 @@ class Results:
         self.state.change("theme", *(f"r_{name}" for name in watched.split()))(lambda **_: self.request())
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
-        self.state.change("r_playing")(self._play_or_stop)
+        self.state.change("r_playing")(lambda **_: session.start(self._play()))
         server = session.server
         server.trigger("r_png")(self.png)
         server.trigger("r_film")(self.film)
@@ -104,10 +98,8 @@ class Results:
         self.state.r_numbers, self.state.r_step = len(numbers), 0
         self.state.r_moment = str(numbers[0])
         folder = self.session.results
-        self.state.r_has = [
-            *(["particles"] if (folder / "particles").is_dir() else []),
-            *(["tracks"] if (folder / "tracks.nc").is_file() else []),
-        ]
+        kept = {"particles": folder / "particles", "tracks": folder / "tracks.nc"}
+        self.state.r_has = [name for name, path in kept.items() if path.exists()]
         self._first_look()
         self.request()
 
@@ -148,9 +140,12 @@ class Results:
         state.r_box = [[float(low), float(high), float((high - low) / 200) or 0.1] for low, high in bounds]
         state.r_x, state.r_y, state.r_z = (float(value) for value in grid.center)
         names = [name for name in (*LABELS, *grid.array_names) if name in grid.array_names and name != "velocity"]
-        state.r_fields = [{"title": label(name), "value": name} for name in dict.fromkeys(names)]
+        state.r_fields = [{"title": title_of(name), "value": name} for name in dict.fromkeys(names)]
         some = [name for name in SURFACES if name in grid.array_names]
-        state.r_surfaces = [{"title": "none", "value": ""}, *({"title": label(name), "value": name} for name in some)]
+        state.r_surfaces = [
+            {"title": "none", "value": ""},
+            *({"title": title_of(name), "value": name} for name in some),
+        ]
         state.r_every = max(1, round(max(grid.dimensions) / 16))
         state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
         self._range_of_level()
@@ -210,7 +205,7 @@ class Results:
         for folder, picture, view in zip(folders, self.pictures, self.views, strict=False):
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
-                raise InputError(f"{label(wanted.colour)}: {folder} has no such field. Choose another colour.")
+                raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
             picture.show(grid, wanted, self.clouds(folder, wanted.moment), title_of(wanted.colour))
             view.update()
         low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
@@ -251,10 +246,6 @@ class Results:
     def _step_to(self, r_step: int, **_: Any) -> None:
         if self.session.results is not None and self.state.r_numbers:
             self.state.r_moment = self.state.r_moments[int(r_step)]["value"]
-
-    def _play_or_stop(self, r_playing: bool, **_: Any) -> None:
-        if r_playing:
-            self.session.start(self._play())
 
     async def _play(self) -> None:
         """Show one moment after the other until it is stopped."""
@@ -332,16 +323,10 @@ class Results:
 
     def csv(self) -> Any:
         """Return the vectors of the moment as a table, a row each."""
-        grid = self.grid(str(self.session.results), self.wanted.moment)
-        names = [name for name in grid.array_names if name != "velocity"]
-        text = io.StringIO()
-        writer = csv.writer(text)
-        units = [LABELS.get(name, ("", ""))[1] for name in names]
-        named = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
-        writer.writerow(["x [mm]", "y [mm]", "z [mm]", *named])
-        table = np.column_stack([grid.points, *(grid[name] for name in names)])
-        writer.writerows([[f"{value:.9g}" for value in row] for row in table])
-        return self._attached(text.getvalue().encode())
+        vectors = layers.field_at(self.open(str(self.session.results)), self.wanted.moment)
+        with tempfile.TemporaryDirectory() as folder:
+            tables.write_vectors(vectors.load(), Path(folder) / "field.csv")
+            return self._attached((Path(folder) / "field.csv").read_bytes())
 
     def copy(self) -> None:
         """Show the script that draws what is seen."""
@@ -402,12 +387,13 @@ class Results:
         controls.choice("r_colours", "colour map", (list(COLOURS),))
         controls.switch("r_own", "colours over the field's own range")
         with html.Div(v_if="!r_own"):
-            controls.slider(
-                "r_low", "lowest", ("Math.min(r_low, -Math.abs(r_high))",), ("r_high",), ("Math.abs(r_high) / 100",)
+            low, high, step = (
+                "Math.min(r_low, -Math.abs(r_high))",
+                "2 * Math.abs(r_high) || 1",
+                "(r_high - r_low) / 100",
             )
-            controls.slider(
-                "r_high", "highest", ("r_low",), ("2 * Math.abs(r_high) || 1",), ("Math.abs(r_high) / 100 || 0.01",)
-            )
+            controls.slider("r_low", "lowest", (low,), ("r_high",), (step,))
+            controls.slider("r_high", "highest", ("r_low",), (high,), (step,))
 
     def _layer_controls(self) -> None:
         html.H3("Planes")
@@ -438,11 +424,8 @@ class Results:
 
     def _chart_controls(self) -> None:
         html.H3("Chart")
-        kinds = [
-            {"title": "histogram", "value": "histogram"},
-            *({"title": f"profile along {a}", "value": a} for a in "xyz"),
-        ]
-        controls.choice("r_chart_kind", "chart", (kinds,))
+        kinds = ["histogram", "x", "y", "z"]
+        controls.choice("r_chart_kind", "histogram, or profile along an axis", (kinds,))
         html.Div(v_html=("r_chart",))
 
     def _out_controls(self) -> None:
@@ -450,14 +433,7 @@ class Results:
         with html.Div(classes="lf-buttons"):
             for name in VIEWS:
                 controls.button(name, (self.look_along, f"['{name}']"))
-            for name, icon in (
-                ("left", "⟲"),
-                ("right", "⟳"),
-                ("up", "↑"),
-                ("down", "↓"),
-                ("closer", "+"),
-                ("farther", "−"),
-            ):
+            for name, icon in zip(("left", "right", "up", "down", "closer", "farther"), "⟲⟳↑↓+−", strict=True):
                 controls.button(icon, (self.look_along, f"['{name}']"), title=f"turn {name}", id=f"r-turn-{name}")
         controls.choice("r_other", "side by side with", ("r_others",), id="r-other")
         html.H3("Take along")
@@ -469,11 +445,6 @@ class Results:
             controls.button("VTI", "utils.download('field.vti', trigger('r_vti'), 'application/xml')")
             controls.button("CSV", "utils.download('field.csv', trigger('r_csv'), 'text/csv')")
             controls.button("Copy as Python", self.copy, "mdi-language-python", id="r-copy")
-
-
-def label(name: str) -> str:
-    """Return what people call a field."""
-    return LABELS.get(name, (name.replace("_", " "), ""))[0]
 
 
 def title_of(name: str) -> str:

@@ -36,15 +36,9 @@ def view_of(camera: Mapping[str, Any], shape: tuple[int, int]) -> View:
         Middle of the main lens, corners of the rectangle, and the unit vector from the origin to the camera [mm].
     """
     rows, columns = shape
-    optics = Optics(
-        focal_length_mm=float(camera["focal_length_mm"]),
-        magnification=float(camera["magnification"]),
-        f_number=float(camera["f_number"]),
-        microlens_pitch_mm=float(camera["microlens_pitch_mm"]),
-        microlens_focal_length_mm=float(camera["microlens_focal_length_mm"]),
-        pixel_mm=float(camera["pixel_um"]) / 1000,
-        sensor_shape=shape,
-    )
+    names = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
+    numbers = {name: float(camera[name]) for name in names}
+    optics = Optics(**numbers, pixel_mm=float(camera["pixel_um"]) / 1000, sensor_shape=shape)
     towards = direction_of(camera)
     right = np.cross([0.0, 1.0, 0.0], towards)
     right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])

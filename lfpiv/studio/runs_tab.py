@@ -9,17 +9,11 @@ import trame_client.widgets.html as html
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.errors import InputError
-from lfpiv.results.folder import Folder
 from lfpiv.studio import controls, run_process
 from lfpiv.studio.session import Session
 
 LOOK_EVERY_S = 0.5
 """Time between two looks at a run [s]."""
-
-
-def build(session: Session) -> None:
-    """Build the tab."""
-    Runs(session)
 
 
 class Runs:
@@ -31,8 +25,8 @@ class Runs:
         self.state.update(
             {
                 "p_out": "results", "p_pairs": "", "p_volumes": False, "p_workers": "", "p_status": "none",
-                "p_stages": [], "p_log": "", "p_warnings": [], "p_end": "", "p_stop_with_studio": False, "p_since": "",
-                "p_report": False, "p_left": "",
+                "p_stages": [], "p_log": "", "p_warnings": [], "p_end": "", "p_stop_with_studio": False,
+                "p_left": "",
             }
         )  # fmt: skip
         session.listeners.append(self._changed)
@@ -93,7 +87,7 @@ class Runs:
             return
         found = run_process.holder(out)
         if found is not None and self.process != found.process:
-            self.process, s.p_since = found.process, found.since
+            self.process = found.process
         now = "none" if self.process is None else run_process.status(self.process)
         if now in ("running", "paused") or s.p_status in ("running", "paused"):
             s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
@@ -102,7 +96,6 @@ class Runs:
         if s.p_status in ("running", "paused") and now == "ended":
             self._ended(out)
         s.p_status = now
-        s.p_report = Folder(out).report.is_file()
 
     def _ended(self, out: Path) -> None:
         """Show warnings of the finished run, and its results in the other tabs."""

@@ -108,13 +108,7 @@ async def _run(session: Any, port: int) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, end)
-    await session.server.start(
-        port=port,
-        host="127.0.0.1",
-        exec_mode="coroutine",
-        thread=True,  # no handlers of signals besides those above
-        open_browser=False,
-        show_connection_info=False,
-        disable_logging=True,
-        timeout=0,
-    )
+    await session.server.start(  # thread: no handlers of signals besides those above
+        port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
+        disable_logging=True, timeout=0, thread=True,
+    )  # fmt: skip

@@ -88,7 +88,11 @@ class Session:
                 with self.state:
                     self.tell(error)
 
-        task = asyncio.get_running_loop().create_task(watched())
+        try:
+            task = asyncio.get_running_loop().create_task(watched())
+        except RuntimeError:  # before the server runs; its start tells all states again
+            work.close()
+            return
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
 

@@ -21,11 +21,6 @@ SIGNIFICANT = 4
 """Digits of the numbers that dragging writes."""
 
 
-def build(session: Session) -> None:
-    """Build the tab."""
-    Space(session)
-
-
 class Space:
     """State, picture and panel of the tab."""
 

@@ -46,8 +46,11 @@ class Page:
         return self.browser.execute_script(f"return trame.state.get('{name}')")
 
     def open(self, tab):
-        self.browser.execute_script(f"trame.state.set('tab', '{tab}')")
-        until(lambda: self.find(f"tab-{tab}").is_displayed())
+        def shown():
+            self.browser.execute_script(f"trame.state.set('tab', '{tab}')")
+            return any(part.is_displayed() for part in self.browser.find_elements("id", f"tab-{tab}"))
+
+        until(shown, FIRST_S)
 
     def find(self, name):
         return self.browser.find_element("id", name)
