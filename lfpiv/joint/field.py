@@ -75,8 +75,10 @@ def joint_field(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> xr.Data
     field = xr.Dataset(variables, axes)
     near = vectors.sel({axis: field[axis] for axis in AXES}, method="nearest")
     for axis in _COMPONENTS:
-        about = f"standard deviation of the displacement along {axis} at this place"
-        field[f"uncertainty_{axis}"] = _variable(WIDENED * near[f"uncertainty_{axis}"].values, "voxel", about)
+        deviation = WIDENED * near[f"uncertainty_{axis}"].values
+        field[f"uncertainty_{axis}"] = _variable(
+            deviation, "voxel", f"standard deviation of the displacement along {axis}"
+        )
     about = {"long_name": "the nearest vector is valid, near, and a mean of the fit"}
     valid = (near["valid"] & near["joint"]).values
     for number, axis in enumerate(AXES):

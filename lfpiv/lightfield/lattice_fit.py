@@ -159,7 +159,6 @@ def disagreement(
     dict or None
         ``fit``, a clause; ``shift_px`` and ``shift_pitch``, if the image fits when it is shifted.
     """
-    others = others or {}
     folding = _folding_of(decoder)
     cells, centres = _fold(light, folding)
     if len(cells[0]) < _FEWEST_TILES:
@@ -169,15 +168,7 @@ def disagreement(
     stretch = None if alike else _stretch(cells, centres, folding)
     if not (found.shifted or stretch or misplaced):
         return None
-    hypotheses = [
-        *((f"{how} it fits", turned, decoder) for how, turned in _turned(light)),
-        *((f"it fits the white image of camera {name}", light, other) for name, other in others.items()),
-    ]
-    likeness = {}
-    for what, image, lattice in hypotheses:
-        fit = fit_lattice(image, lattice) if image.shape == lattice.gain.shape else None
-        if fit is not None and not fit.shifted and fit.unshifted > LEAST_LIKENESS:
-            likeness[what] = fit.unshifted
+    likeness = _hypotheses(light, decoder, others or {})
     if stretch is not None:
         likeness[stretch.sentence] = stretch.likeness
     best = max([found.likeness, *likeness.values()])
@@ -190,11 +181,28 @@ def disagreement(
     return (shift if found.likeness > LEAST_LIKENESS else {}) | {"fit": ", ".join(fits)}
 
 
+def _hypotheses(
+    light: np.ndarray, decoder: LightFieldDecoder, others: Mapping[str, LightFieldDecoder]
+) -> dict[str, float]:
+    """Return what makes the image's light fit, and how well: its mirror images and turns, and the other cameras."""
+    hypotheses = [
+        *((f"{how} it fits", turned, decoder) for how, turned in _turned(light)),
+        *((f"it fits the white image of camera {name}", light, other) for name, other in others.items()),
+    ]
+    likeness = {}
+    for what, image, lattice in hypotheses:
+        fit = fit_lattice(image, lattice) if image.shape == lattice.gain.shape else None
+        if fit is not None and not fit.shifted and fit.unshifted > LEAST_LIKENESS:
+            likeness[what] = fit.unshifted
+    return likeness
+
+
 def _stretch(cells: Cells, centres: np.ndarray, folding: _Folding) -> LatticeStretch | None:
     """Return the turn and the change of pitch that make the image's microimages those of the white image."""
     stretch = fit_stretch(*cells, centres, folding.basis, folding.half_diagonal)
-    explained = stretch is not None and stretch.likeness > LEAST_LIKENESS
-    return stretch if explained and stretch.gain > max(_GAIN, 1 - stretch.likeness) else None
+    if stretch is None or stretch.likeness < LEAST_LIKENESS or stretch.gain < max(_GAIN, 1 - stretch.likeness):
+        return None
+    return stretch
 
 
 def _turned(light: np.ndarray) -> list[tuple[str, np.ndarray]]:
@@ -256,7 +264,7 @@ def _places(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the places of pixels, relative to the sensor's centre, over its half diagonal, shape (2, pixels)."""
     rows, columns = np.divmod(pixels, shape[1])
     middle = (np.array([[shape[1]], [shape[0]]]) - 1) / 2
-    places: np.ndarray = (np.stack([columns, rows]) - middle) / (np.hypot(*shape) / 2)
+    places: np.ndarray = (np.stack([columns, rows]) - middle) / (np.hypot(shape[0], shape[1]) / 2)
     return places
 
 

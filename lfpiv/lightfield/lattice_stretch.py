@@ -134,7 +134,8 @@ def _harmonics() -> np.ndarray:
     """Return the orders of the harmonics of a cell, one of each conjugate pair, shape (harmonics, 2)."""
     order = np.arange(-_HARMONICS, _HARMONICS + 1)
     rows, columns = (part.ravel() for part in np.meshgrid(order, order, indexing="ij"))
-    return np.stack([rows, columns], axis=-1)[(rows > 0) | ((rows == 0) & (columns > 0))]
+    chosen: np.ndarray = np.stack([rows, columns], axis=-1)[(rows > 0) | ((rows == 0) & (columns > 0))]
+    return chosen
 
 
 def _spectra(part: np.ndarray, pixels: np.ndarray, order: np.ndarray) -> np.ndarray:
