@@ -126,7 +126,7 @@ class Draft:
             table = ExperimentTable.model_validate(values)
         except ValidationError as error:
             found = problems.explain_each(error, ExperimentTable, values)
-            return {dotted(location): text for location, text in found.items()}
+            return {".".join(map(str, location)): text for location, text in found.items()}
         try:
             check_tables(self.path, table)
         except InputError as error:
@@ -179,11 +179,6 @@ class Draft:
             plain = row["plain"] or isinstance(value, str)
             texts[row["id"]] = "" if value is None else str(value) if plain else tomlkit.item(value).as_string().strip()
         return texts
-
-
-def dotted(location: Sequence[int | str]) -> str:
-    """Return the dotted name of a place; a place inside a list is that of the list."""
-    return ".".join(str(part) for part in location)
 
 
 def location_of(name: str) -> Location:

@@ -107,8 +107,6 @@ class Form:
         with self.state:
             self.state.x_checked = text
 
-    # -- page ---------------------------------------------------------------------------------------------------------
-
     def _page(self) -> None:
         edit = self.session.guarded(self.edit)
         with html.Div(classes="lf-form"):

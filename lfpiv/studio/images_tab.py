@@ -52,8 +52,6 @@ class Images:
         session.listeners.append(self._changed)
         self._panel()
 
-    # -- data ---------------------------------------------------------------------------------------------------------
-
     def _changed(self, what: str) -> None:
         """Forget what belongs to an experiment or a run that was open before."""
         if what not in ("experiment", "results", "saved"):
@@ -189,8 +187,6 @@ class Images:
         if len(planes) == 2:  # red and cyan: what both see is white
             planes = [np.stack([planes[0], planes[1], planes[1]], axis=-1)]
         s.i_plane = self.session.offer(planes[0])
-
-    # -- page ---------------------------------------------------------------------------------------------------------
 
     def _panel(self) -> None:
         with html.Div(classes="lf-split"):

@@ -202,8 +202,6 @@ class Preview:
                 *answer["limits"],
             ]
 
-    # -- page ---------------------------------------------------------------------------------------------------------
-
     def _panel(self) -> None:
         guarded = self.session.guarded
         with html.Div(classes="lf-split"):

@@ -5,6 +5,7 @@ Overlays are in pixels (column, row) of the recorded picture, before `image_flip
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,6 +44,7 @@ class RawImages:
     results: Path | None = None
     """Folder of a run, whose calibration is taken; without one, cameras are nominal thin lenses."""
     cameras: dict[str, CalibratedCamera] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
     measured: bool = False
     """Whether the cameras are calibrated."""
     grids: dict[str, np.ndarray] = field(default_factory=dict)
@@ -83,13 +85,17 @@ class RawImages:
 
     def calibrated(self, camera: str) -> CalibratedCamera:
         """Return a camera: that of the results, or a thin lens in its nominal place."""
+        with self.lock:
+            return self._known()[camera]
+
+    def _known(self) -> dict[str, CalibratedCamera]:
         if not self.cameras:
             file = Folder(self.results).calibration if self.results is not None else None
             if file is not None and file.is_file():
                 self.cameras, self.measured = dict(lfpiv.load_calibration(file).cameras), True
             if set(self.cameras) != {setup.name for setup in self.experiment.cameras}:
                 self.cameras, self.measured = dict(lfpiv.thin_lens(self.experiment).cameras), False
-        return self.cameras[camera]
+        return self.cameras
 
     def lens_grid(self, camera: str) -> np.ndarray:
         """Return the lattice indices of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
@@ -187,13 +193,9 @@ class RawImages:
         if self.signal is None or self.signal[0] is not image:
             self.signal = image, image - np.float32(found.decoder.background(image)[0])
         values = found.decoder.sample(self.signal[1], self.lens_grid(camera), pupil_mm)
-        return self._upright(camera, np.nan_to_num(values))
-
-    def _upright(self, camera: str, values: np.ndarray) -> np.ndarray:
-        """Turn an array over the lenses (i, j) so that it lies as the recorded picture."""
-        basis = np.asarray(self.calibrated(camera).lattice.basis_mm)
+        basis = np.asarray(found.lattice.basis_mm)
         along = values.T if abs(basis[0][0]) >= abs(basis[0][1]) else values
-        return self.recorded(camera, along)
+        return self.recorded(camera, np.nan_to_num(along))
 
     def refocused(self, camera: str, name: str, z_mm: float) -> np.ndarray:
         """Return the light that comes from a plane of the volume, x to the right and y up; 0 where none is seen.

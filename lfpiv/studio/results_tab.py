@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyvista as pv
 import trame_client.widgets.html as html
@@ -73,8 +74,6 @@ class Results:
         server.trigger("r_csv")(self.csv)
         session.listeners.append(self._opened)
         self._panel()
-
-    # -- data ---------------------------------------------------------------------------------------------------------
 
     def _opened(self, what: str) -> None:
         """Open other results."""
@@ -160,8 +159,6 @@ class Results:
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
         self.state.r_ends = [low, high, (high - low) / 200 or 1.0]
         self.state.r_level = low + 0.6 * (high - low)
-
-    # -- pictures -----------------------------------------------------------------------------------------------------
 
     @property
     def wanted(self) -> look.Look:
@@ -274,13 +271,12 @@ class Results:
             picture.plotter.renderer.ResetCameraClippingRange()
             view.update()
 
-    # -- what leaves the studio ---------------------------------------------------------------------------------------
-
     def png(self) -> Any:
         """Return the picture as PNG, side by side where two runs are compared."""
         images = [picture.image() for picture in self.pictures[: 2 if self.state.r_other else 1]]
         rows = min(image.shape[0] for image in images)
-        return self._attached(encoded(np.hstack([image[:rows] for image in images])))
+        whole = np.hstack([image[:rows] for image in images])[..., ::-1]
+        return self._attached(bytes(cv2.imencode(".png", np.ascontiguousarray(whole))[1]))
 
     async def film(self, kind: str) -> Any:
         """Return a film of the series, or of one turn, as MP4."""
@@ -340,8 +336,6 @@ class Results:
 
     def _attached(self, content: bytes) -> Any:
         return self.session.server.protocol.addAttachment(content)
-
-    # -- page ---------------------------------------------------------------------------------------------------------
 
     def _panel(self) -> None:
         with html.Div(classes="lf-split"):
@@ -451,10 +445,3 @@ def title_of(name: str) -> str:
     """Return what people call a field, with its unit."""
     text, unit = LABELS.get(name, (name.replace("_", " "), ""))
     return f"{text} [{unit}]" if unit else text
-
-
-def encoded(image: np.ndarray) -> bytes:
-    """Return a picture as PNG."""
-    import cv2
-
-    return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1])

@@ -122,8 +122,6 @@ class Runs:
         if self.process is not None and self.state.p_stop_with_studio:
             run_process.stop(self.process)
 
-    # -- page ---------------------------------------------------------------------------------------------------------
-
     def _page(self) -> None:
         control = self.session.guarded(self.control)
         running = "['running', 'paused'].includes(p_status)"

@@ -80,6 +80,11 @@ class Session:
 
     def start(self, work: Coroutine[Any, Any, Any]) -> None:
         """Do work beside the page, which stays alive; its errors are shown there."""
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:  # before the server runs; its start tells all states again
+            work.close()
+            return
 
         async def watched() -> None:
             try:
@@ -88,11 +93,7 @@ class Session:
                 with self.state:
                     self.tell(error)
 
-        try:
-            task = asyncio.get_running_loop().create_task(watched())
-        except RuntimeError:  # before the server runs; its start tells all states again
-            work.close()
-            return
+        task = loop.create_task(watched())
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
 

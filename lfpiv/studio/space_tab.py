@@ -215,8 +215,6 @@ class Space:
         p.reset_camera(bounds=None if name == "rig" else np.repeat(middle, 2) + 1.3 * (box - np.repeat(middle, 2)))
         p.renderer.ResetCameraClippingRange()
 
-    # -- page ---------------------------------------------------------------------------------------------------------
-
     def _panel(self) -> None:
         guarded = self.session.guarded
         with html.Div(classes="lf-split"):

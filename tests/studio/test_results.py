@@ -71,5 +71,5 @@ def test_the_page_shows_and_turns_results(results, browser):
         browser.find_element("id", "r-turn-left").click()
         until(lambda: browser.execute_script(shown) != second)
         browser.find_element("id", "r-copy").click()
-        script = until(lambda: browser.find_element("id", "r-script").get_property("value"))
+        script = until(lambda: "".join(one.get_property("value") for one in browser.find_elements("id", "r-script")))
         assert "slices=(" in script and "camera_position" in script
