@@ -37,7 +37,7 @@ def view_of(camera: Mapping[str, Any], shape: tuple[int, int]) -> View:
     """
     rows, columns = shape
     names = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
-    numbers = {name: float(camera[name]) for name in names}
+    numbers: dict[str, Any] = {name: float(camera[name]) for name in names}
     optics = Optics(**numbers, pixel_mm=float(camera["pixel_um"]) / 1000, sensor_shape=shape)
     towards = direction_of(camera)
     right = np.cross([0.0, 1.0, 0.0], towards)
