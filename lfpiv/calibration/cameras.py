@@ -182,7 +182,7 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
     _log_board(errors)
     with collected() as warnings:
         scales.check_scales(experiment, cameras)
-        checks.check_board(errors, board, pitch)
+        checks.check_board(errors, board, pitch, experiment.path)
     return replace(errors, warnings=tuple(warnings))
 
 

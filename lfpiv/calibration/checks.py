@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -65,6 +66,8 @@ VALUES_PER_DOT = 12
 """Values that one dot contributes: a ray model for s and t, quadratic in the pupil point."""
 REJECTED = 0.5
 """Part of a plane's dots that is rejected above which a warning is due."""
+STEEPEST_DEG = 4.0
+"""Largest tilt of a plane of the board against the others [degree]: ten times what a stage does."""
 OFF_PITCHES = 1.0
 """Distance of a plane's dots from where they are stated to be above which a warning is due [microlens pitch]."""
 ROUNDING = 0.4
@@ -255,11 +258,25 @@ def check_rejected(experiment: Experiment, setup: CameraSetup, dots: BoardDots, 
         warn(log, Warning(code=Code.PLANE_LEFT_OUT, subject=setup.name, figures=figures))
 
 
-def check_board(errors: BoardErrors, board: DotBoard, pitch_mm: float) -> None:
+def check_board(errors: BoardErrors, board: DotBoard, pitch_mm: float, path: Path) -> None:
     """Warn of each plane whose dots lie, root mean square, further off than `OFF_PITCHES`.
 
-    `pitch_mm` is the microlens pitch as an object in focus sees it [mm].
+    `pitch_mm` is the microlens pitch as an object in focus sees it [mm], `path` the experiment file.
+
+    Raises
+    ------
+    InputError
+        If a plane is tilted against the others by more than `STEEPEST_DEG`: bent rays look like that, too.
     """
+    tilts = np.degrees(errors.plane[:, 3:5] - np.median(errors.plane[:, 3:5], axis=0))
+    steepest = int(np.hypot(*tilts.T).argmax())
+    if (tilt := float(np.hypot(*tilts[steepest]))) > STEEPEST_DEG:
+        raise InputError(
+            f"{path}: board.planes_mm: expected planes that a stage moves without tilting them, found that the dots of "
+            f"plane {steepest} (z = {board.planes_mm[steepest]:g} mm) fit only if it is tilted by {tilt:.1f} degrees "
+            "against the others. If the board was not tilted, rays cross a window or liquid at so steep an angle that "
+            "the calibration cannot follow them: look through it more squarely, or through a prism."
+        )
     dots = np.arange(len(board.planes_mm) * board.size)
     off = errors.points_mm(board, dots) - board.of_dots_mm(dots)
     rms = np.sqrt((off**2).sum(1).reshape(-1, board.size).mean(1))

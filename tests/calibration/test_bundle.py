@@ -1,5 +1,7 @@
 """Errors of the board, fitted to labels by formula: recovery, what is not observable, outliers, and real optics."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
+from lfpiv.errors import InputError
 from lfpiv.simulation.scene_camera import Aberrations, SceneCamera, Window, true_mapping
 from lfpiv.warn import Code
 
@@ -144,10 +147,19 @@ def test_one_plane_far_off_leaves_the_others_where_they_are():
     found = fitted(true_points(plane, dots), ANGLES["two cameras"])
     assert np.abs(found.plane[:, :3] - plane[:, :3]).max() < 2e-3
     with warn.collected() as warnings:
-        checks.check_board(found, BOARD, 0.1)
+        checks.check_board(found, BOARD, 0.1, Path("experiment.toml"))
     (warning,) = warnings
     assert warning.code is Code.PLANE_OFF
     assert "plane 2 of the board stands at z = -0.180 mm, not at -0.3 mm" in warning.sentence
+
+
+def test_a_plane_that_no_stage_tilts_is_refused():
+    """Rays bent at the surface of a liquid, which one camera cannot tell from a tilt, left 0.6 pitch unseen."""
+    plane, dots = errors_of(np.random.default_rng(0))
+    plane[1, 4] = np.radians(6)
+    found = fitted(true_points(plane, dots), ANGLES["two cameras"])
+    with pytest.raises(InputError, match=r"experiment.toml: board.planes_mm: .* plane 1 .* tilted by [56]\.\d degrees"):
+        checks.check_board(found, BOARD, 0.1, Path("experiment.toml"))
 
 
 def test_the_image_of_another_plane_is_not_taken_for_an_error_of_the_stage():
