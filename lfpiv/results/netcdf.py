@@ -200,7 +200,7 @@ def write_vectors(
     reconstruction : Dataset, optional
         From `build_reconstruction`; stored as the group "reconstruction".
     field : Dataset, optional
-        From `lfpiv.joint.field.joint_field`; stored as the group "field".
+        From `lfpiv.joint_field`; stored as the group "field".
 
     Raises
     ------
