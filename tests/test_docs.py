@@ -51,8 +51,8 @@ MODULES = {
 ENDINGS = ("py", "md", "h", "toml", "h5", "json", "html", "nc", "pvd", "jsonl", "zarr", "cih")
 """Endings of file names, which look like attributes of modules."""
 
-LONG = ("benchmark", "demo", "init", "reproduce", "simulate")
-"""Commands that take long or ask questions: checked to be understood, not run. Each has tests of its own."""
+LONG = ("benchmark", "demo", "init", "reproduce", "simulate", "studio")
+"""Commands that take long, ask or serve a page: checked to be understood, not run. Each has tests of its own."""
 
 
 def blocks(page):
