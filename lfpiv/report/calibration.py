@@ -240,7 +240,7 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
 
 def pupil_residual(displacement: np.ndarray) -> str:
     """Draw how far the light of the dots lies beside the fitted rays, by zone of the pupil (zone, 2) [pitch]."""
-    figure, (axes,) = new_panel(3.1)
+    figure, axes = new_panel(3.1)
     middle, size = zone_middles(), np.linalg.norm(displacement, axis=1)
     shown = axes.scatter(*middle.T, c=size, s=60, cmap="viridis", vmin=0)
     step = displacement * (0.2 / max(float(size.max()), 1e-12))

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import lfpiv
-from lfpiv.runs import pair as pair_work
-from lfpiv.runs import pipeline
+from lfpiv.runs import frame_work, pipeline
 
 
 def with_tracking(small_run, folder, keys=""):
@@ -20,8 +19,8 @@ def with_tracking(small_run, folder, keys=""):
 
 @pytest.mark.slow
 def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run, tmp_path, caplog, monkeypatch):
-    again, read = [], pair_work.frame_light
-    monkeypatch.setattr(pair_work, "frame_light", lambda *given: again.append(1) or read(*given))
+    again, read = [], frame_work.frame_light
+    monkeypatch.setattr(frame_work, "frame_light", lambda *given: again.append(1) or read(*given))
     experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
     shutil.rmtree(out / "volumes", ignore_errors=True)
     summary = pipeline.run(experiment, out, pairs=(0, 1))
