@@ -66,8 +66,6 @@ VALUES_PER_DOT = 12
 """Values that one dot contributes: a ray model for s and t, quadratic in the pupil point."""
 REJECTED = 0.5
 """Part of a plane's dots that is rejected above which a warning is due."""
-ZONE_PITCHES = 0.08
-"""Displacement of light in a zone of the pupil above which a warning is due: a sound hexagonal array shows 0.06."""
 STEEPEST_DEG = 4.0
 """Largest tilt of a plane of the board against the others [degree]: ten times what a stage does."""
 OFF_PITCHES = 1.0
@@ -318,6 +316,6 @@ def check_mapping(
 def check_pupil_zones(setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> None:
     """Warn where the light of the dots lies beside their labels in a zone of the pupil: the lens bends rays further."""
     off_mm, (u, v) = worst(dots.left_over_mm)
-    if off_mm > ZONE_PITCHES * pitch_mm:
+    if off_mm > 0:
         figures = {"off_pitch": off_mm / pitch_mm, "u": u, "v": v, "f_number": setup.optics.f_number}
         warn(log, Warning(code=Code.PUPIL_ZONE, subject=setup.name, figures=figures))

@@ -20,7 +20,7 @@ PARTS = 4
 
 _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
-_SIGMA = 5.0  # least displacement, in standard errors, that is told
+_CLEAR = 1.5  # root mean square over the zones of displacements in standard errors that is told; 1 by chance
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
 
 
@@ -39,25 +39,41 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
     Returns
     -------
     ndarray, shape (PARTS, ZONES, 2)
-        Mean displacement of the rays [mm]; all zero unless one is beyond its error and beyond what hardly matters.
+        Mean displacement of the rays [mm]. All are zero unless the zones of a part, or of the whole field, are together
+        displaced by more than their errors, and one by more than what hardly matters.
     """
     found = np.zeros((PARTS, ZONES, 2))
-    right, up = (chief_mm > np.median(chief_mm, axis=0)).T if len(chief_mm) else np.zeros((2, 0), bool)
+    if len(fits) < _FEWEST:
+        return found
+    pull, information = (
+        np.stack([getattr(fit, name) for fit in fits]).astype(float) for name in ("zone_pull", "zone_information")
+    )
+    right, up = (chief_mm > np.median(chief_mm, axis=0)).T
+    parts = [np.flatnonzero(right + 2 * up == part) for part in range(PARTS)]
     clear = False
-    for part in range(PARTS):
-        here = [fit for fit, at in zip(fits, right + 2 * up, strict=True) if at == part]
+    for part, here in enumerate([*parts, np.arange(len(fits))]):  # the last one is the whole field, judged as well
         if len(here) < _FEWEST:
             continue
-        pull = np.stack([fit.zone_pull for fit in here]).astype(float)
-        information = np.stack([fit.zone_information for fit in here]).astype(float)
-        inverse = np.linalg.inv(information.sum(0) + np.eye(2 * ZONES) / (_PRIOR_PITCHES * pitch_mm) ** 2)
-        mean = inverse @ pull.sum(0)
-        miss = (pull - information @ mean) @ inverse  # of single dots, which includes their model errors
-        error = np.sqrt((miss**2).sum(0) * len(here) / (len(here) - 1))
-        size, limit = (np.linalg.norm(one.reshape(2, ZONES), axis=0) for one in (mean, error))
-        clear |= bool(np.any(size > np.maximum(_SIGMA * limit, _LEAST_PITCHES * pitch_mm)))
-        found[part] = mean.reshape(2, ZONES).T
+        mean, error = _displacement(pull[here], information[here], pitch_mm)
+        size, limit = (np.linalg.norm(one, axis=1) for one in (mean, error))
+        sure = float(np.sqrt(np.mean((size / limit) ** 2))) > _CLEAR
+        clear |= sure and bool(size.max() > _LEAST_PITCHES * pitch_mm)
+        if part < PARTS:
+            found[part] = mean
     return found if clear else np.zeros_like(found)
+
+
+def _displacement(pull: np.ndarray, information: np.ndarray, pitch_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the displacement that dots have in common, and its standard error, shape (ZONES, 2) [mm].
+
+    The error is the scatter of the dots, which includes errors of their model, and at least what their pixels' noise
+    makes of it: a zone that few dots light scatters too little.
+    """
+    inverse = np.linalg.inv(information.sum(0) + np.eye(2 * ZONES) / (_PRIOR_PITCHES * pitch_mm) ** 2)
+    mean = inverse @ pull.sum(0)
+    scatter = (((pull - information @ mean) @ inverse) ** 2).sum(0) * len(pull) / (len(pull) - 1)
+    error = np.sqrt(np.maximum(scatter, np.diag(inverse)))
+    return mean.reshape(2, ZONES).T, error.reshape(2, ZONES).T
 
 
 def mean_size(displacement_mm: np.ndarray) -> float:
