@@ -29,7 +29,7 @@ STANDARD_NAMES = {
 
 
 def _along(axis: str, u: str) -> dict[str, tuple[str, ...]]:
-    """Return the common names of the quantities along one axis; `u` is that of the velocity."""
+    """Return the common names of the quantities along one axis; `u` is the velocity's."""
     velocity = "{u} v{x} v_{x} u{x} velocity_{x} {x}_velocity {u}_velocity vel_{x} velocity_{u} vel{x}"
     displacement = "d{x} displacement_{x} {x}_displacement disp_{x} shift_{x} delta_{x} delta{x}"
     spread = [f"{stem}_{name}" for stem in ("uncertainty", "sigma", "std") for name in ("{x}", "{u}", "d{x}", "v{x}")]

@@ -312,7 +312,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
 
 
 def _missing_images(path: Path, table: ExperimentTable) -> str:
-    """Name all images that a new file states and that are not there, those of a camera's board or pairs together."""
+    """Name all images that a new file states and that are not there, the board's or the pairs' of a camera together."""
     from lfpiv.experiment.readers.source import split
     from lfpiv.experiment.recording import Recording
 

@@ -73,7 +73,7 @@ class RecordedImages:
         self._seen = {name: image > LIT_SHARE * image.max() for name, image in even.items()}
 
     def particles(self, images: Sequence[Mapping[str, np.ndarray]], noise: Mapping[str, float]) -> RecordedParticles:
-        """Measure the particles of some frames; `noise` is that of their background [counts].
+        """Measure the particles of some frames; `noise` is the noise of their background [counts].
 
         Raises
         ------

@@ -50,7 +50,7 @@ class Recording:
     names: tuple[str, str] = FRAME_NAMES[0], FRAME_NAMES[1]
     """Text for ``{frame}`` in the paths of both images of a pair."""
     first: int = 0
-    """Number of the first pair, in a series that of the first instant."""
+    """Number of the first pair, in a series of the first instant."""
     step: int = 1
     """Number of frames from the first to the second frame of a pair."""
     lasers: int = 2
@@ -117,7 +117,7 @@ class Recording:
 
     @property
     def numbers(self) -> range:
-        """Numbers of all pairs, in a series those of their first instants."""
+        """Numbers of all pairs, in a series of their first instants."""
         return range(self.first, self.first + self.pairs)
 
     @property

@@ -50,9 +50,9 @@ def joint_field(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> xr.Data
         If the volumes are not from a joint fit, or the vectors have no ``dt_s`` or are not the vectors of a joint fit.
     """
     if not is_joint(*volumes):
-        raise ValueError("volumes: expected those of a joint fit, got others. Use reconstruct_pair(estimate='joint').")
+        raise ValueError("volumes: expected volumes of a joint fit, got others: use reconstruct_pair(estimate='joint')")
     if "joint" not in vectors or "dt_s" not in vectors.attrs:
-        raise ValueError("vectors: expected those of joint_vectors(volumes, dt_s=...), got others.")
+        raise ValueError("vectors: expected the result of joint_vectors(volumes, dt_s=...), got others.")
     first, dt_s = volumes[0], float(vectors.attrs["dt_s"])
     edges = dict(zip(AXES, np.asarray(vectors.attrs["voxel_mm"], float), strict=True))
     places = {axis: np.arange((n - 1) % STEP // 2, n, STEP) for axis, n in zip(AXES, first.shape, strict=True)}

@@ -198,7 +198,7 @@ def _hypotheses(
 
 
 def _stretch(cells: Cells, centres: np.ndarray, folding: _Folding) -> LatticeStretch | None:
-    """Return the turn and the change of pitch that make the image's microimages those of the white image."""
+    """Return the turn and the change of pitch that lay the image's microimages on the white image's."""
     stretch = fit_stretch(*cells, centres, folding.basis, folding.half_diagonal)
     if stretch is None or stretch.likeness < LEAST_LIKENESS or stretch.gain < max(_GAIN, 1 - stretch.likeness):
         return None

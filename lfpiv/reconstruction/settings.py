@@ -21,7 +21,7 @@ PLAIN: dict[str, Any] = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1,
 
 @dataclass(frozen=True, kw_only=True)
 class SmartSettings:
-    """Settings of SMART. The defaults are those of the table ``[smart]`` of an experiment file.
+    """Settings of SMART. Its defaults hold for the table ``[smart]`` of an experiment file, too.
 
     Raises
     ------

@@ -60,8 +60,8 @@ def reconstruct(
     progress : callable, optional
         Called with the finished fraction.
     **smart
-        The other settings, by the names in `lfpiv.reconstruction.settings.SmartSettings`, which are those of the table
-        ``[smart]`` of an experiment file. Their defaults are the table's.
+        The other settings, by the names in `lfpiv.reconstruction.settings.SmartSettings`, which the table
+        ``[smart]`` of an experiment file has, too. Their defaults are the table's.
 
     Returns
     -------

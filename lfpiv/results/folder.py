@@ -129,7 +129,7 @@ class Folder:
         return self.path / "volumes" / f"{self.recording.frame_of(pair, frame).stem}.nc"
 
     def new_volumes(self, pair: int) -> list[Path]:
-        """Return the paths of a pair's volumes that no later pair has: both, or that of the first instant."""
+        """Return the paths of a pair's volumes that no later pair has: both, or in a series the first one."""
         return [self.volume(pair, frame) for frame in range(self.recording.lasers)]
 
     def stored(self, numbers: range, *, vectors: bool, volumes: bool) -> bytearray:

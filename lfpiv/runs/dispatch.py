@@ -42,7 +42,7 @@ TICK_S = 0.5
 def sequential(work: PairWork, pending: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
     """Do pairs one after the other in this process; yield the outcome of each.
 
-    Pairs are taken from `pending` when their turn comes; those of a series come along its chains. `length_hint`
+    Pairs are taken from `pending` when their turn comes; pairs of a series come along its chains. `length_hint`
     says how many may come.
     """
     source = iter(pending)

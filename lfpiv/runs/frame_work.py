@@ -39,7 +39,7 @@ class FrameWork:
     guard: Layers
     """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
     refinement: float
-    """Edge of a voxel of the experiment over that of the weights, which volumes are sampled from."""
+    """Edge of a voxel of the experiment over the edge of the weights' voxels, from which volumes are sampled."""
     weights: Weights | None
     """None if all volumes are in the folder."""
     cameras: Mapping[str, CalibratedCamera]

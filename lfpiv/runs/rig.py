@@ -274,7 +274,7 @@ def pair_work(
     calibration: Calibration | None = None,
     figures: WeightsFigures | None = None,
 ) -> PairWork:
-    """Return the work on pairs, whose cameras are those of `calibration` if there are no weights.
+    """Return the work on pairs, whose cameras `calibration` gives if there are no weights.
 
     Without `figures` of the weights, the refusals are those of an earlier invocation.
     """

@@ -5,11 +5,11 @@ show. The frames after it show as much again. Here the volumes of a few frames o
 flow to the present one, as in simultaneous motion tracking enhancement [1]_. Particles are in all of them. A ghost
 moves with the mean of the particles whose lines of sight cross in it, so it is elsewhere in most of them.
 
-The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n those of all frames moved to
-it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles in their
-places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the flow by
-which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark ones stay
-dark. A step by a part of the rays follows (`RowSubsets.correcting`).
+The guess is E ((G E_1 ... G E_n)^(1 / n) / G E)^S, with E the present volume, E_1 to E_n the volumes of all frames
+moved to it, the present one included, and G a Gaussian of the size of a particle. So a volume keeps its own particles
+in their places, and only their brightness changes: the mean of moved volumes itself would draw displacements to the
+flow by which they were moved. Volumes are smoothed once and moved then. They are moved to bright voxels only, as dark
+ones stay dark. A step by a part of the rays follows (`RowSubsets.correcting`).
 
 .. [1] K. P. Lynch, F. Scarano, "An efficient and accurate approach to MTE-MART for time-resolved tomographic PIV", Exp.
    Fluids 56 (2015) 66, doi:10.1007/s00348-015-1934-6.
@@ -42,7 +42,7 @@ FAINT = 0.01
 
 
 def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow: xr.Dataset) -> np.ndarray:
-    """Return the guess of a frame from its volume and those of the frames beside it.
+    """Return the guess of a frame from its volume and the volumes of the frames beside it.
 
     Parameters
     ----------

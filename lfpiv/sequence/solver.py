@@ -47,7 +47,7 @@ PERSISTENCE = 0.9
 FLOW_MEMORY = 0.7
 """Weight of the flow known before in the flow that moves the next frame."""
 FIRST_SHARE = 0.35
-"""Iterations of a frame that starts from its images, as a share of those of a frame by itself."""
+"""Iterations of a frame that starts from its images, as a share of the iterations of a frame by itself."""
 ITERATION_SHARE = 0.2
 """Iterations of a predicted frame over iterations of an independent frame."""
 SHARE_SUBSETS = 4
@@ -135,7 +135,7 @@ class SequenceSolver:
         Solver of each frame. One that starts from the frame before has `ITERATION_SHARE` of its iterations.
     correlation : mapping, optional
         Settings of `correlate`, which measures the flow; default: those of an experiment without such a table. Windows
-        that are None are those of `lfpiv.sequence.flow`.
+        that are None are taken from `lfpiv.sequence.flow`.
     measure : callable, optional
         Replaces `lfpiv.sequence.flow.measure_flow`, for a caller that knows the flow.
     """

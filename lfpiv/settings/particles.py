@@ -29,7 +29,7 @@ class Particles(Table):
     frames: tuple[Name, Name] = ("a", "b")
     """Text for ``{frame}`` in the first and second image of a pair."""
     background: Literal["auto", "none", "minimum", "median"] = "auto"
-    """Light that stands still, subtracted from the images: that of `background_image`, or what the series of pairs
+    """Light that stands still, subtracted from the images: the light of `background_image`, or what the series of pairs
     shows beyond chance ("auto"), the minimum or median of each pixel over the series, or nothing ("none")."""
 
     @field_validator("frames")

@@ -48,7 +48,7 @@ class Smart(Table):
     """Standard deviation of the Gaussians that make up the volume [voxel]; 0 lets voxels vary freely, "auto" takes the
     particles' size from the images, or 0 where particles are smaller than voxels."""
     refinement: Annotated[float, Field(strict=True, ge=1, le=bounds.LARGEST_REFINEMENT)] | Literal["auto"] = "auto"
-    """Edge of a voxel over that of the voxels that are reconstructed, which the volume is then sampled from; "auto"
+    """Edge of a voxel over the edge of the reconstructed voxels, from which the volume is then sampled; "auto"
     follows from the particles' size in the images, and is 1 where they are large enough."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
@@ -98,7 +98,7 @@ class Tracking(Table):
     weakest: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     """Least light of a particle in each camera that counts, as a share of the typical particle's."""
     vectors: Literal["auto", "links", "correlation"] = "auto"
-    """Whether a pair's vectors are means of its linked particles' flow, or those of the correlation; "auto" takes links
+    """Whether a pair's vectors are means of its linked particles' flow, or come from correlation; "auto" takes links
     where a single camera is used, which resolves depth worse by correlation."""
 
     def gives_vectors(self, cameras: int) -> bool:

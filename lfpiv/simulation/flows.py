@@ -151,7 +151,7 @@ class SwirlingJet(Table):
     radius_ratio: Annotated[float, Field(strict=True, gt=0.05, lt=0.95)] = 12 / 17
     """Radius of the central channel over the nozzle's."""
     mass_ratio: Annotated[float, Field(strict=True, ge=0, le=20)] = 0.42
-    """Mass flow of the central channel over that of the swirled annulus."""
+    """Mass flow of the central channel over the mass flow of the swirled annulus."""
     shear_layer_mm: Length = 1.7
     """Half thickness of the shear layers, which are tanh profiles [mm]."""
     spreading: Annotated[float, Field(strict=True, ge=0, le=2)] = 0.5

@@ -98,7 +98,7 @@ def routes(session: Session) -> list[web.RouteDef]:
 
 
 def roots_of(given: Path) -> tuple[Path, ...]:
-    """Return the folders that may be looked at: the folder that is given, or that of a file, a run or a store."""
+    """Return the folders that may be looked at: a given folder, or the folder of a given file, run or store."""
     return (given if given.is_dir() and not is_store(given) and not _is_run(given) else given.parent,)
 
 

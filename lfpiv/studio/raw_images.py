@@ -23,7 +23,7 @@ from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.results.folder import Folder
 
 HOT_SIGMA, HOT_RATIO = 12.0, 5.0
-"""Least height of a hot pixel: in standard deviations of the noise, and over that of its highest neighbour."""
+"""Least height of a hot pixel: in standard deviations of the noise, and over the height of its highest neighbour."""
 MOST_LISTED = 1000
 """Largest number of frames of particles that are listed."""
 MOST_MARKS = 3000
@@ -84,7 +84,7 @@ class RawImages:
         return image
 
     def calibrated(self, camera: str) -> CalibratedCamera:
-        """Return a camera: that of the results, or a thin lens in its nominal place."""
+        """Return a camera: from the results, or a thin lens in its nominal place."""
         with self.lock:
             return self._known()[camera]
 
@@ -108,7 +108,7 @@ class RawImages:
         return np.ascontiguousarray(array[FLIPS[self.experiment.camera(camera).image_flip]])
 
     def recorded_px(self, camera: str, places: np.ndarray) -> np.ndarray:
-        """Return places (column, row) of a recorded picture from those of the picture as it is read, or back."""
+        """Return places (column, row) of a recorded picture from places of the picture as it is read, or back."""
         setup = self.experiment.camera(camera)
         rows, columns = setup.optics.sensor_shape
         places, flip = np.array(places, float), FLIPS[setup.image_flip]
@@ -225,7 +225,7 @@ class RawImages:
         )
 
     def _stack(self, camera: str, name: str, pupil: np.ndarray) -> np.ndarray:
-        """Return the pupil views of an image, shape (point, i, j); those of the last images are kept."""
+        """Return the pupil views of an image, shape (point, i, j); the last images' views are kept."""
         key = (camera, name)
         if key not in self.views:
             while len(self.views) > 3:

@@ -195,10 +195,8 @@ class Results:
         """Draw what the state asks for, in both pictures if two runs are compared."""
         if self.session.results is None:
             return
-        wanted, folders = (
-            self.wanted,
-            [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])],
-        )
+        wanted = self.wanted
+        folders = [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
         for folder, picture, view in zip(folders, self.pictures, self.views, strict=False):
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:

@@ -79,7 +79,7 @@ def test_the_field_is_kept_beside_the_vectors(volumes, vectors, tmp_path):
 
 
 def test_what_was_not_fitted_jointly_is_refused(volumes, vectors):
-    with pytest.raises(ValueError, match="expected those of a joint fit"):
+    with pytest.raises(ValueError, match="expected volumes of a joint fit"):
         lfpiv.joint_field([volume.drop_vars(UNSHARED) for volume in volumes], vectors)
-    with pytest.raises(ValueError, match="expected those of joint_vectors"):
+    with pytest.raises(ValueError, match="expected the result of joint_vectors"):
         lfpiv.joint_field(volumes, vectors.drop_vars("joint"))

@@ -115,12 +115,17 @@ def test_an_instant_with_nothing_beside_it_is_that_of_its_images(solver, series)
     assert np.array_equal(solver.correct(done, 0).volume, alone.volume), "the flow is not known"
 
 
+def rough_vectors():
+    """Vectors of the flow that alternate along x by as much as no flow that is resolved does."""
+    rough = vectors_of(FLOW)
+    bumps = (-1.0) ** np.arange(rough.sizes["x"]) * sequence.ROUGHEST
+    return rough.assign({f"displacement_{axis}": rough[f"displacement_{axis}"] + bumps for axis in "xyz"})
+
+
 @pytest.mark.slow
 def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     _, images, _ = series
-    rough = vectors_of(FLOW)
-    bumps = (-1.0) ** np.arange(rough.sizes["x"]) * sequence.ROUGHEST
-    rough = rough.assign({f"displacement_{axis}": rough[f"displacement_{axis}"] + bumps for axis in "xyz"})
+    rough = rough_vectors()
     unresolved = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings, known: rough)
     done, _ = along(unresolved, images[:3])
     assert done[2].start is Start.UNRESOLVED
@@ -132,9 +137,7 @@ def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
 @pytest.mark.slow
 def test_after_some_flows_that_are_not_resolved_none_is_measured(solver, series):
     _, images, _ = series
-    rough = vectors_of(FLOW)
-    bumps = (-1.0) ** np.arange(rough.sizes["x"]) * sequence.ROUGHEST
-    rough = rough.assign({f"displacement_{axis}": rough[f"displacement_{axis}"] + bumps for axis in "xyz"})
+    rough = rough_vectors()
     measured = []
     unresolved = SequenceSolver(solver.smart, CORRELATION, lambda *arguments: measured.append(arguments) or rough)
     done, before = along(unresolved, images[:6])

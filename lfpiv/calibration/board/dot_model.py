@@ -110,7 +110,7 @@ class LensIntegral:
         """Return the terms of the ray model in the mean over the rays of each pixel, shape (n, TERMS + bends).
 
         A pixel and its blur are taken as a Gaussian of their variance, cut off by the edge of the pupil. Where rays are
-        bent to third order at most, the terms are those of the pixel's middle.
+        bent to third order at most, the terms belong to the pixel's middle.
 
         Parameters
         ----------
