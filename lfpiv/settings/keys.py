@@ -56,12 +56,11 @@ def unit_of(key: str) -> str:
 def key_rows(model: type[BaseModel]) -> list[tuple[str, str, str, str]]:
     """Key, what it may be, default and meaning of each field of a model that holds a value, no table."""
     schema, meanings = model.model_json_schema(), field_meanings(model)
-    rows = []
+    definitions, rows = schema.get("$defs", {}), []
     for name, field in model.model_fields.items():
         entry = schema["properties"][name]
-        if _is_table(entry, schema["$defs"] if "$defs" in schema else {}):
-            continue
-        rows.append((name, _range(entry, schema.get("$defs", {})), _default(field), meanings.get(name, "")))
+        if not _is_table(entry, definitions):
+            rows.append((name, _range(entry, definitions), _default(field), meanings.get(name, "")))
     return rows
 
 

@@ -7,6 +7,9 @@ from typing import Any
 import trame_client.widgets.html as html
 from trame.widgets import vuetify3 as v3
 
+DIGITS = 5
+"""Digits of a slider's value in the field beside it."""
+
 
 def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str = "", **more: Any) -> None:
     """Show a slider of a value of the state, with a field beside it in which the value is typed."""
@@ -17,8 +20,8 @@ def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str =
             thumb_size=14, track_size=3, aria_label=label,
         )  # fmt: skip
         html.Input(
-            type="number", value=(name,), step="any", aria_label=f"{label}, typed", id=f"n-{name}",
-            change=f"{name} = Number($event.target.value)",
+            type="number", value=(f"+Number({name}).toPrecision({DIGITS})",), step="any", id=f"n-{name}",
+            aria_label=f"{label}, typed", change=f"{name} = Number($event.target.value)",
         )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.images import FLIPS
 from lfpiv.geometry.optics import spread_over_pupil
+from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.results.folder import Folder
 
@@ -131,7 +132,7 @@ class RawImages:
         """Return saturated and hot pixels of an image as it is read, each (n, 2) in the recorded picture."""
         clipped = saturated_pixels(image, self.experiment.camera(camera).white_level)
         around = ndimage.maximum_filter(image, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
-        noise = 1.4826 * float(np.median(np.abs(np.diff(image[:, ::7], axis=0)))) / np.sqrt(2)
+        noise = NORMAL_MAD * float(np.median(np.abs(np.diff(image[:, ::7], axis=0)))) / np.sqrt(2)
         level = float(np.percentile(image[::5, ::5], 5))
         hot = image - level > HOT_RATIO * np.maximum(around - level, 0) + HOT_SIGMA * max(noise, 1.0)
         return {
