@@ -19,14 +19,14 @@ def with_tracking(small_run, folder, keys=""):
 
 @pytest.mark.slow
 def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run, tmp_path, caplog, monkeypatch):
-    again, read = [], frame_work.frame_light
-    monkeypatch.setattr(frame_work, "frame_light", lambda *given: again.append(1) or read(*given))
+    frames_read, read = [], frame_work.frame_light
+    monkeypatch.setattr(frame_work, "frame_light", lambda *given: frames_read.append(given[3].number) or read(*given))
     experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
     shutil.rmtree(out / "volumes", ignore_errors=True)
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     file = out / "particles" / "pair_0000.nc"
     table = lfpiv.open_particles(out)
-    assert not again, "images are read once, for volumes and particles"
+    assert frames_read == [0, 1], "images are read once, for volumes and particles"
     figures = next(entry for entry in summary["pairs"] if entry["pair"] == 0)["particles"]
     assert figures["linked"] == table.sizes["particle"] > 20
     valid = table["valid"].values
