@@ -57,20 +57,29 @@ def trusted(grid: pv.ImageData, replaced: bool, uncertainty: float | None) -> pv
     return shown
 
 
-def slice_at(grid: pv.ImageData, axis: str, at_mm: float) -> pv.DataSet:
-    """Return the plane normal to an axis at a place [mm]."""
+def slim(grid: pv.ImageData, *names: str) -> pv.ImageData:
+    """Return a grid with some of the fields, since filters spend their time on all of them."""
+    some = pv.ImageData(dimensions=grid.dimensions, spacing=grid.spacing, origin=grid.origin)
+    for name in names:
+        some[name] = grid[name]
+    return some
+
+
+def slice_at(grid: pv.ImageData, axis: str, at_mm: float, colour: str) -> pv.DataSet:
+    """Return the plane normal to an axis at a place [mm], with the field that colours it."""
     origin = list(grid.center)
     low, high = grid.bounds[2 * "xyz".index(axis) :][:2]
     origin["xyz".index(axis)] = min(max(at_mm, low + 1e-9), high - 1e-9)
-    return grid.slice(normal=axis, origin=origin)
+    return slim(grid, colour).slice(normal=axis, origin=origin)
 
 
 def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.PolyData:
     """Return the surface on which a field has a level, with the field that colours it."""
-    slim = pv.ImageData(dimensions=grid.dimensions, spacing=grid.spacing, origin=grid.origin)
-    for name in (field, colour):
-        slim[name] = np.nan_to_num(np.asarray(grid[name]), nan=float(np.nanmin(grid[name], initial=0.0)))
-    return slim.contour([level], scalars=field)
+    some = slim(grid, field, colour)
+    for name in {field, colour}:
+        if np.isnan(grid[name]).any():
+            some[name] = np.nan_to_num(grid[name], nan=float(np.nanmin(grid[name], initial=0.0)))
+    return some.contour([level], scalars=field)
 
 
 def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.PolyData:

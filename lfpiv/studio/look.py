@@ -102,13 +102,15 @@ class Picture:
         for axis, at in zip("xyz", look.slices, strict=True):
             self._layer(
                 f"slice {axis}", None if at is None else (key, at, shade),
-                lambda axis=axis, at=at: layers.slice_at(grid, axis, at), **paint, lighting=False, nan_opacity=0.0,
+                lambda axis=axis, at=at: layers.slice_at(grid, axis, at, look.colour), **paint,
+                lighting=False, nan_opacity=0.0,
             )  # fmt: skip
         self._layer(
-            "surface", look.surface and (key, look.surface, look.level, look.opacity, shade),
-            lambda: layers.surface(grid, look.surface or "", look.level, look.colour), **paint, opacity=look.opacity,
-            smooth_shading=True,
+            "surface", look.surface and (key, look.surface, look.level, shade),
+            lambda: layers.surface(grid, look.surface or "", look.level, look.colour), **paint, smooth_shading=True,
         )  # fmt: skip
+        if "surface" in self.plotter.actors:
+            self.plotter.actors["surface"].prop.opacity = look.opacity
         self._layer(
             "arrows", look.arrows and (key, look.arrows, look.length, shade),
             lambda: layers.arrows(grid, look.arrows, look.length, False), **paint,

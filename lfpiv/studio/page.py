@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
+from lfpiv.studio import delivery
 from lfpiv.studio.access import Places
 from lfpiv.studio.form_tab import Form
 from lfpiv.studio.images_tab import Images
@@ -33,11 +33,6 @@ TABS: dict[str, tuple[str, Callable[[Session], Any]]] = {
     "results": ("Results", Results),
 }
 """Name of a tab -> its title, and the class that builds it."""
-
-ENCODED_S = 0.01
-"""Time after which the server looks for an encoded picture again [s]."""
-MOST_LOOKS = 500
-"""Number of looks until the server takes a picture for lost."""
 
 
 def build(given: Path) -> Session:
@@ -63,26 +58,10 @@ def build(given: Path) -> Session:
             "{{ message }}", v_model=("message_shown",), timeout=15000, multi_line=True, location="top", color="error",
             classes="lf-message",
         )  # fmt: skip
-    server.add_protocol_to_configure(_deliver_soon)
+    server.add_protocol_to_configure(delivery.send_at_once)
     session.changed("experiment")
     session.changed("results")
     return session
-
-
-def _deliver_soon(protocol: Any) -> None:
-    """Send a picture as soon as it is encoded. trame-vtk looks again once, after half a second."""
-    for part in protocol.getLinkProtocols():
-        if hasattr(part, "render_stale_image"):
-            part.delta_stale_time_before_render = ENCODED_S
-            part.render_stale_image = functools.partial(_look_again, part)
-
-
-def _look_again(part: Any, view: str, looks: int = 0) -> None:
-    """Send the picture of a view if it is encoded by now; look again otherwise."""
-    if part.stale_handler_count.get(view, 0) > 0:
-        part.stale_handler_count[view] -= 1
-        if part.last_stale_time.get(view) and looks < MOST_LOOKS:
-            part.push_render(view, False, looks + 1)
 
 
 def routes(session: Session) -> list[web.RouteDef]:

@@ -34,7 +34,7 @@ def test_a_surface_has_its_level_and_a_plane_its_place(results):
     grid = layers.grid_of(layers.field_at(lfpiv.open_results(results), "0"))
     surface = layers.surface(grid, "u", 0.0, "u")
     assert surface.n_points and np.allclose(surface["u"], 0.0, atol=1e-6)
-    plane = layers.slice_at(grid, "y", 0.1)
+    plane = layers.slice_at(grid, "y", 0.1, "u")
     assert np.allclose(np.asarray(plane.points)[:, 1], 0.1)
     hidden = layers.trusted(grid, True, None)
     assert np.array_equal(np.isnan(hidden["u"]), grid["valid"] < 0.5) and hidden["valid"].min() == 0

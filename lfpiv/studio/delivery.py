@@ -1,0 +1,64 @@
+"""Pictures of VTK's windows for the page: rendered, encoded as JPEG and sent at once.
+
+trame-vtk encodes in other threads and looks later whether they are done. That takes longer than the picture itself.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import cv2
+import numpy as np
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
+
+LEAST_PX = 10
+"""Views of hidden tabs are smaller, and are not drawn."""
+
+
+def send_at_once(protocol: Any) -> None:
+    """Let the protocol that delivers pictures of views encode them itself."""
+    for part in protocol.getLinkProtocols():
+        if hasattr(part, "still_render"):
+            part.decode = False  # pictures are bytes
+            part.still_render = functools.partial(_rendered, part)
+
+
+def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the picture of a view as trame-vtk sends it; none where nothing changed while it is turned."""
+    window = part.get_view(options["view"])
+    columns, rows = (max(int(length), LEAST_PX) for length in options.get("size") or window.GetSize())
+    turning = options["view"] in part.views_in_animations
+    drawn = (_changed(window), columns, rows)
+    reply = {"stale": False, "mtime": 1, "size": [columns, rows], "global_id": options["view"], "image": None}
+    if turning and getattr(window, "lfpiv_drawn", None) == drawn:
+        return reply
+    if tuple(window.GetSize()) != (columns, rows):
+        window.SetSize(columns, rows)
+    window.Render()
+    window.lfpiv_drawn = drawn
+    picture = encoded(pixels(window), int(options.get("quality", 95)))
+    return reply | {"image": picture, "memsize": len(picture)}
+
+
+def _changed(window: Any) -> int:
+    """Return when what a window shows was changed last, in VTK's count of changes."""
+    times = [window.GetMTime()]
+    for renderer in window.GetRenderers():
+        times += [renderer.GetMTime(), renderer.GetActiveCamera().GetMTime()]
+        times += [prop.GetRedrawMTime() for prop in renderer.GetViewProps()]
+    return int(max(times))
+
+
+def pixels(window: Any) -> np.ndarray:
+    """Return the pixels of a rendered window, shape (rows, columns, 3), red first."""
+    columns, rows = window.GetSize()
+    values = vtkUnsignedCharArray()
+    window.GetPixelData(0, 0, columns - 1, rows - 1, 0, values, 0)
+    return vtk_to_numpy(values).reshape(rows, columns, 3)[::-1]
+
+
+def encoded(picture: np.ndarray, quality: int) -> bytes:
+    """Return a picture as JPEG."""
+    return cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
