@@ -179,7 +179,7 @@ def _init(
     ),
     **answers: str | None,
 ) -> None:
-    """Write a commented experiment file from options. On a terminal, ask for what they leave out.
+    """Write a commented experiment file from options. On a terminal, ask for what they leave out and has no default.
 
     No image needs to exist yet. The file says where each number is found; an existing one is not overwritten.
     """

@@ -14,7 +14,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
-from lfpiv.runs import pipeline
+from lfpiv.runs import pipeline, unchanged
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.simulator import simulate
@@ -57,7 +57,10 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
             log.info("simulated experiment: made before, kept")
         else:
             simulate(scene, experiment.parent, progress=lambda _, fraction: report("simulation", fraction))
-    summary = pipeline.run(experiment, out, device=device, progress=progress)
+    command = {"experiment": str(experiment), "pairs": None, "device": device, "keep_volumes": False}
+    summary = unchanged.repeat(command | {"workers": None, "scheduler": None}, out)
+    if summary is None:
+        summary = pipeline.run(experiment, out, device=device, progress=progress)
     return summary | {"demo": compare_with_truth(scene, out)}
 
 

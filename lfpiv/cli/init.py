@@ -7,6 +7,7 @@ how its text is read.
 from __future__ import annotations
 
 import inspect
+import itertools
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -258,10 +259,12 @@ class Written(NamedTuple):
     """How many vectors a run measures."""
     warnings: tuple[str, ...]
     """What too few vectors leave out."""
+    taken: tuple[str, ...]
+    """Options that were neither given nor asked for, with the values that are taken."""
 
 
 def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
-    """Write a new experiment file from given answers; on an interactive terminal ask for the others.
+    """Write a new experiment file from given answers; on an interactive terminal ask for others without a default.
 
     Parameters
     ----------
@@ -289,7 +292,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
 
     if path.exists():
         raise InputError(f"{path}: expected a new file to write, found one that exists. Name another, or remove it.")
-    answers = _answers(given, path)
+    answers, taken = _answers(given, path)
     values = Values.model_validate(answers)
     text = experiment_text(values)
     table = validated(parse(text, path), path, ExperimentTable)
@@ -308,7 +311,7 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
         missing = _missing_images(path, table) or str(error)
     vectors = vector_grid.sentence(table.correlation, grid.shape, grid.voxel_mm)
     warnings = vector_grid.warnings(table.correlation, grid.shape)
-    return Written(missing, vectors, tuple(warning.sentence for warning in warnings))
+    return Written(missing, vectors, tuple(warning.sentence for warning in warnings), taken)
 
 
 def _missing_images(path: Path, table: ExperimentTable) -> str:
@@ -332,42 +335,61 @@ def _missing_images(path: Path, table: ExperimentTable) -> str:
     return f"no such files: {', '.join(found)}" if found else ""
 
 
-def _answers(given: Mapping[str, str | None], path: Path) -> dict[str, Any]:
-    """Read the given answers, and ask for the missing ones or take their defaults."""
+def _answers(given: Mapping[str, str | None], path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Read the given answers, take defaults, and ask for the rest; return the answers, and what is taken unasked."""
     answers: dict[str, Any] = {}
-    interactive, missing = sys.stdin.isatty(), []
+    interactive, missing, taken = sys.stdin.isatty(), [], []
     for one in QUESTIONS:
         text = given[one.key]
-        default = _default(one, answers, path)
+        if text is None and (text := _default(one, answers, path)) is not None:
+            taken.append(f"{one.option} {text}")
         if text is None and interactive:
-            answers[one.key] = _ask(one, default)
+            answers[one.key] = _ask(one)
             continue
-        if text is None and default is None:
+        if text is None:
             missing += [one.option] if one.key != "voxel_mm" else []  # which follows from others that are missing
             continue
         try:
-            answers[one.key] = one.value(default or "" if text is None else text)
+            answers[one.key] = one.value(text)
         except ValueError as error:
             raise InputError(f"{one.option}: {error}.") from None
     if missing:
         raise InputError(f"init: expected {', '.join(missing)}: without a terminal nothing is asked.")
-    return answers
+    return answers, tuple(taken)
 
 
 def _default(one: Question, answers: Mapping[str, Any], path: Path) -> str | None:
-    """Return the default of a question, which may follow from earlier answers or, when asked, from a recording."""
+    """Return the default of a question, which may follow from earlier answers or from images that are there."""
     if one.key == "name":
         return path.absolute().parent.name or "experiment"
-    if one.key == "dt_s" and sys.stdin.isatty() and {"cameras", "particle_images"} <= set(answers):
+    if one.key in ("dt_s", "count") and {"cameras", "particle_images"} <= set(answers):
         from lfpiv.experiment.recorded_times import proposed
 
-        return proposed(path, answers["particle_images"], answers["cameras"][0][0])
+        read = proposed if one.key == "dt_s" else _counted
+        return read(path, answers["particle_images"], answers["cameras"][0][0])
     if one.key == "voxel_mm" and {"microlens_pitch_mm", "magnification"} <= set(answers):
         return f"{answers['microlens_pitch_mm'] / abs(answers['magnification']):.3g}"
     return one.default
 
 
-def _ask(one: Question, default: str | None) -> Any:
+def _counted(path: Path, particle_images: str, camera: str) -> str | None:
+    """Count the pairs or instants of a camera whose images are there; None without any, or where a file has many."""
+    from lfpiv.experiment.readers.source import split
+
+    def file(number: int) -> Path:
+        fields = {"camera": camera, "instant": number, "pair": number, "image": number, "frame": "a"}
+        return split(path.parent / particle_images.format(**fields)).file
+
+    try:
+        if file(0) == file(1):
+            return None
+        count = next(number for number in itertools.count() if not file(number).is_file())
+    except (LookupError, ValueError):  # the pattern is checked elsewhere
+        return None
+    return str(count) if count else None
+
+
+def _ask(one: Question) -> Any:
     """Ask until the answer can be read."""
 
     def read(text: str) -> Any:
@@ -376,4 +398,4 @@ def _ask(one: Question, default: str | None) -> Any:
         except ValueError as error:
             raise typer.BadParameter(f"{error}.") from None
 
-    return typer.prompt(one.text[0].upper() + one.text[1:], default=default, value_proc=read, err=True)
+    return typer.prompt(one.text[0].upper() + one.text[1:], value_proc=read, err=True)

@@ -198,13 +198,15 @@ def print_run(summary: dict[str, Any], out: Path) -> None:
 def print_init(experiment: Path, written: Written) -> None:
     """Print where the experiment file is, how many vectors it will give, what is missing, and the next command."""
     say(f"experiment: {experiment}")
+    if written.taken:
+        say(f"taken without a question, change it in the file where it is wrong: {', '.join(written.taken)}")
     say(f"a run measures {written.vectors}")
     for text in written.warnings:
         say(f"warning: {text}")
     if written.missing:
         say(f"not complete yet: {written.missing}")
     say(f"next: lfpiv check {experiment} --out results, which shows the axes, or lfpiv studio {experiment}")
-    say(f"then: lfpiv run {experiment} --out results")
+    say(f"then: lfpiv calibrate, lfpiv preview and lfpiv run, each with {experiment} --out results")
 
 
 def print_check(found: dict[str, Any]) -> None:

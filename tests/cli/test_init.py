@@ -47,7 +47,7 @@ def test_options_give_a_valid_commented_file(tmp_path, capfd):
     path = tmp_path / "jet" / "experiment.toml"
     assert call(path, *EXAMPLE) == 0
     shown = capfd.readouterr().out
-    assert f"experiment: {path}" in shown and f"lfpiv check {path}" in shown and f"lfpiv run {path}" in shown
+    assert f"experiment: {path}" in shown and f"lfpiv check {path}" in shown and f"each with {path}" in shown
     missing = next(line for line in shown.splitlines() if line.startswith("not complete yet"))
     for name in ("white/left.tif", "white/right.tif", "board/right/plane_00.tif", "plane_08.tif (9 images)"):
         assert name in missing
@@ -82,11 +82,12 @@ def test_an_experiment_whose_images_exist_is_complete(tiny_experiment, capfd):
     options = (
         "--cameras left=30,right=-30 --focal-length 100 --magnification -1 --f-number 4 --microlens-pitch 0.1 "
         "--microlens-focal-length 0.8 --pixel 10 --dots 5x5 --spacing 0.1 --dot-diameter 0.02 --planes=-0.2,0.2 "
-        "--pairs 2 --size 0.8x0.6x0.4 --voxel 0.05 --dt 1e-3 --name tiny "
+        "--size 0.8x0.6x0.4 --voxel 0.05 --dt 1e-3 --name tiny "
         "--images particles/{camera}/{pair:04d}{frame}.tif"
     )
     assert call(path, *shlex.split(options)) == 0
-    assert "not complete yet" not in capfd.readouterr().out
+    shown = capfd.readouterr().out
+    assert "not complete yet" not in shown and "--pairs 2" in shown  # counted by the images
     made, given = lfpiv.open_experiment(path), lfpiv.open_experiment(tiny_experiment)
     assert made.board == given.board and made.grid.shape == given.grid.shape and made.dt_s == given.dt_s
     assert [camera.optics for camera in made.cameras] == [camera.optics for camera in given.cameras]
@@ -152,17 +153,18 @@ def test_a_terminal_is_asked_for_what_is_left_out_until_the_answer_can_be_read(t
         index = words.index(option)
         del words[index : index + 2]
     given = {word.partition("=")[0] for word in words}
-    text = "".join(f"{answers.get(one.key, '')}\n" for one in init.QUESTIONS if one.option not in given)
+    text = "".join(f"{answers[one.key]}\n" for one in init.QUESTIONS if one.option not in given and one.key in answers)
     monkeypatch.setattr(sys, "stdin", Terminal(text))
     assert call(path, *words) == 0
-    asked = capfd.readouterr().err
+    said, asked = capfd.readouterr()
+    assert "--image-flip horizontal" in said and "Pictures show" not in asked  # what has a default is not asked
     assert asked.count("Pixel pitch") == 2 and "decimal point" in asked and "Focal length of the main" not in asked
     table = read_toml(path, ExperimentTable)
     assert [camera.name for camera in table.camera] == ["a", "b"] and table.particles.pairs == 20
-    assert table.board.images == "board/{camera}/plane_{plane:02d}.tif"  # an empty answer takes the default
+    assert table.board.images == "board/{camera}/plane_{plane:02d}.tif"
 
 
 def test_an_interrupted_dialogue_writes_nothing(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(sys, "stdin", Terminal("jet\n"))
+    monkeypatch.setattr(sys, "stdin", Terminal("left=45\n"))
     assert call(tmp_path / "experiment.toml") == 1
     assert "nothing is written" in capfd.readouterr().err and not any(Path(tmp_path).iterdir())
