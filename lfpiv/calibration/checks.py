@@ -18,6 +18,7 @@ from lfpiv.calibration.board.board import few_pixels
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.board.pupil_zones import worst
+from lfpiv.calibration.liquid import LiquidSurface
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
@@ -155,24 +156,30 @@ def check_pupil(
         )
 
 
-def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pitch: float) -> NominalDifference:
+def compare_with_nominal(
+    setup: CameraSetup, fitted: ThinLensModel, residual_pitch: float, surface: LiquidSurface | None = None
+) -> NominalDifference:
     """Warn where the fitted pose or magnification differs from the stated one.
 
     No result depends on the stated values. A difference shows rotated images or a wrong spacing of dots or planes, and
     no other check finds them. The magnification is compared only where the thin lens fits the labels, so not behind a
     tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
+    `surface` is that of a liquid that explains the labels in place of the thin lens.
     """
     stated = setup.orientation
+    rotation = (fitted if surface is None else surface.lens).rotation
     turn = math.nan
     if stated is not None:
-        turn = Rotation.from_matrix(fitted.rotation @ stated.rotation.T).magnitude() * 180 / math.pi
+        turn = Rotation.from_matrix(rotation @ stated.rotation.T).magnitude() * 180 / math.pi
     depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the middle of the board
     magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
     ratio = magnification * setup.optics.object_distance_mm / setup.optics.image_distance_mm
     if turn > TURN_DEG:
         figures = {"turn_deg": float(turn), "nominal": str(stated)}
         warn(log, Warning(code=Code.TURNED, subject=setup.name, figures=figures))
-    if residual_pitch < EXPLAINED_PITCH and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
+    if surface is not None:
+        warn(log, Warning(code=Code.MEDIUM, subject=setup.name, figures=_medium(surface.index)))
+    elif residual_pitch < EXPLAINED_PITCH and not 1 / (1 + MAGNIFICATION) < ratio < 1 + MAGNIFICATION:
         figures = {"magnification": float(magnification), "stated": abs(setup.optics.magnification)}
         warn(log, Warning(code=Code.MAGNIFIED, subject=setup.name, figures=figures))
     elif residual_pitch < FITTED_PITCH:
@@ -180,8 +187,12 @@ def compare_with_nominal(setup: CameraSetup, fitted: ThinLensModel, residual_pit
         # away and with n times the focal length, takes the same images through the same pupil.
         index = fitted.image_distance_mm / setup.optics.image_distance_mm / fitted.pupil_scale
         if abs(index - 1) > MEDIUM:
-            warn(log, Warning(code=Code.MEDIUM, subject=setup.name, figures={"index": index, "depth": 1 / index}))
+            warn(log, Warning(code=Code.MEDIUM, subject=setup.name, figures=_medium(index)))
     return NominalDifference(turn_deg=float(turn), magnification=float(magnification))
+
+
+def _medium(index: float) -> dict[str, float]:
+    return {"index": index, "depth": 1 / index}
 
 
 def check_light(

@@ -11,6 +11,7 @@ import numpy as np
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely_mistake, mistakes, turn_deg
 from lfpiv.calibration.board.planes import Signals, board_images
+from lfpiv.calibration.liquid import liquid_surface
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.experiment.axes import MIRRORED, UPSIDE_DOWN, names_of, stated_for
 from lfpiv.experiment.experiment import CameraSetup, Experiment
@@ -42,10 +43,11 @@ Decoders = Callable[[CameraSetup], LightFieldDecoder]
 def doubtful(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel) -> bool:
     """Return whether the dots of a camera may contradict its stated orientation or the order of the planes.
 
-    Likely mistakes are then tried, which takes seconds. So a right camera may be doubtful.
+    Likely mistakes are then tried, which takes seconds. So a right camera may be doubtful. A camera whose labels the
+    surface of a liquid explains is none.
     """
     stated = setup.orientation
-    if stated is None:
+    if stated is None or liquid_surface(dots, lens, setup.optics) is not None:
         return False
     misfit = np.median(np.linalg.norm(dots.array_mm - lens(dots.points_mm, dots.pupil_mm), axis=1))
     if misfit > FITTED_PITCH * setup.optics.microlens_pitch_mm and abs(lens.pupil_scale - 1) > PUPIL_SCALE:

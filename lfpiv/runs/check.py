@@ -86,7 +86,7 @@ def _view(experiment: Experiment, setup: CameraSetup) -> tuple[BoardView, bool]:
             raise
         found, pose = False, CameraPose.from_plan(decoder.optics, setup.orientation)
     z_mm, signal = board.planes_mm[plane], signals.of_plane(plane)
-    rectified = rectifier(decoder, board)(signal, pose, z_mm)
+    rectified = rectifier(decoder, board, pose)(signal, pose, z_mm)
     reach = board.spacing_mm * (max(board.dots) - 1) / 2
     chief, _ = pose.rays(np.array([[0, 0, z_mm], [reach, 0, z_mm], [0, reach, z_mm]]))
     on_sensor = decoder.optics.sensor_px(chief * (1 + decoder.optics.sensor_per_pupil))

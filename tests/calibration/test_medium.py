@@ -2,16 +2,20 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support import scenes
 from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
 
 import lfpiv
 from lfpiv.calibration import checks
+from lfpiv.calibration.liquid import liquid_surface
 from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
-from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.optics import Optics, random_on_pupil
 from lfpiv.simulation.scene import true_mapping
+from lfpiv.simulation.scene_camera import SceneCamera
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import Code, collected
 
@@ -72,6 +76,52 @@ def test_labels_that_no_thin_lens_fits_are_refused():
     with pytest.raises(lfpiv.InputError, match=r"60 of 100 dots were found.* 0\.30 times"):
         checks.check_pupil(Of, Setup, HalfFound, other_pupil, far)
     assert residual_pitch < checks.FITTED_PITCH
+
+
+def tank(index, height_mm=20.0):
+    """Return a window of 6 mm, normal to z, in front of a liquid."""
+    window = {"point_mm": (0.0, 0.0, height_mm), "normal": (0.0, 0.0, 1.0)}
+    return {"window": (window | {"thickness_mm": 6.0, "index": 1.49, "medium_index": index},)}
+
+
+def surface_of(angle, window, depth=1.0):
+    """Look for a liquid's surface in labels of a board whose planes stand at `depth` times the stated depths."""
+    rng, count = np.random.default_rng(0), 20
+    camera = SceneCamera.model_validate(scenes.camera("left", angle, (400, 400), true_pitch_deg=0.8, **window))
+    points = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2, np.linspace(-0.8, 0.8, 5)), -1).reshape(-1, 3)
+    points, radius = points.repeat(count, 0), camera.optics.pupil_radius_mm
+    pupil = random_on_pupil(radius, len(points), rng)
+    array = true_mapping(camera)(points * (1, 1, depth), pupil) + LABEL_MM * rng.standard_normal(pupil.shape)
+    lens = fit_thin_lens(points, pupil, array, camera.optics)
+    return liquid_surface(SimpleNamespace(points_mm=points, pupil_mm=pupil, array_mm=array), lens, camera.optics)
+
+
+@pytest.mark.parametrize(("angle", "index"), [(-40.0, 1.333), (30.0, 1.333), (45.0, 1.5)])
+def test_the_surface_of_a_liquid_that_a_camera_looks_through_obliquely_explains_its_labels(angle, index):
+    surface = surface_of(angle, tank(index))
+    assert surface.index == pytest.approx(index, abs=INDEX)
+    assert surface.residual_pitch < 3 * LABEL_MM / OPTICS.microlens_pitch_mm
+
+
+@pytest.mark.parametrize(("window", "depth"), [({}, 1.0), ({}, 0.93), ({}, 0.5), ({}, 2.0), (tank(1.0), 1.0)])
+def test_no_liquid_is_found_in_air_whatever_the_scale_of_the_stage(window, depth):
+    assert surface_of(-40.0, window, depth) is None
+
+
+@pytest.mark.slow
+def test_a_camera_that_looks_obliquely_into_water_is_calibrated(tmp_path):
+    camera = scenes.camera("only", -40.0, (420, 400), true_yaw_deg=-42.0, **tank(1.333))
+    more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
+    simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
+    camera = lfpiv.calibrate(tmp_path / "experiment.toml").cameras["only"]
+    (medium,) = (warning for warning in camera.warnings if warning.code is Code.MEDIUM)
+    assert medium.figures["index"] == pytest.approx(1.333, abs=INDEX)
+    assert camera.report["dots_found"] == 5 * 25
+    spec = json.loads((tmp_path / "truth" / "spec.json").read_text("utf-8"))["camera"][0]
+    rng = np.random.default_rng(1)
+    points, pupil = rng.uniform(*camera.region_mm, (4000, 3)), random_on_pupil(camera.optics.pupil_radius_mm, 4000, rng)
+    miss = camera.map(points, pupil) - true_mapping(spec)(points, pupil)
+    assert np.linalg.norm(miss, axis=1).mean() / 0.1 < MAPPING_PITCH
 
 
 @pytest.mark.slow

@@ -39,6 +39,9 @@ _JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
 _BLOBS_PER_TERM = 4  # least number of blobs for each term in which the misses vary beyond the first order
 _CHANCE = 0.2  # largest scatter of a board's dots about their sites [search radius],
 _CHANCE_PITCHES = 0.5  # or [microlens pitch], because a focused dot is located to a lens only
+_MISSED_PITCHES = 0.4  # median miss of a thin lens in air above which dots may lie behind the surface of a liquid
+_MET = 0.8  # largest median miss behind it, relative to the thin lens in air
+_PUPIL_PART = 0.4  # part of the pupil's radius through which dots behind a liquid are looked for
 _LIT_GAIN = 0.3  # least gain of a lit pixel; less is a vignetted corner or a dead lens
 
 
@@ -53,26 +56,73 @@ def find_dots(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, ori
         If no plane shows the board's lattice, or the board certainly has another number of dots than stated.
     """
     optics = decoder.optics
-    rectify = rectifier(decoder, board)
     plan = CameraPose.from_plan(optics, orientation)
-    start = first_lattice(signals, rectify, board, plan)
-    _require_lattice(start, board, plan, f"the nominal orientation ({orientation})", optics)
-    pose = plan.fitted(start.points_mm, start.chief_mm, optics)
-    planes, pose = find_in_planes(signals, rectify, board, pose, start.sign, optics)
+    found = search_planes(signals, decoder, board, plan)
+    _require_lattice(found.start, board, plan, f"the nominal orientation ({orientation})", optics)
+    planes, pose = found.planes, found.pose
     shift = _shift_to_edges([plane.site for plane in planes], pose, decoder, board)
     named = [_name(planes[number], number, shift, board) for number in range(len(planes))]
     dot, chief = (np.concatenate(part) for part in zip(*named, strict=True))
     if any(shift):
         warn(log, Warning(code=Code.BOARD_RENAMED, figures={"columns": int(shift[0]), "rows": int(shift[1])}))
-        pose = plan.fitted(board.of_dots_mm(dot), chief, optics)
+        pose = (plan.behind_liquid if pose.is_behind_liquid else plan).fitted(board.of_dots_mm(dot), chief, optics)
     visible = np.stack([in_field(pose, board.points_mm(plane), optics) for plane in range(len(planes))])
-    return Detection(pose=pose, sign=start.sign, dot=dot, chief_mm=chief, in_field=visible)
+    return Detection(pose=pose, sign=found.start.sign, dot=dot, chief_mm=chief, in_field=visible)
 
 
-def rectifier(decoder: LightFieldDecoder, board: DotBoard) -> Rectifier:
-    """Return the rectifier of a camera to the board with its margin."""
+@dataclass(frozen=True, eq=False)
+class PlaneSearch:
+    """Dots of all planes about a plan of the camera."""
+
+    start: FirstLattice
+    planes: list[PlaneDots]
+    pose: CameraPose
+    miss_mm: float
+    """Median distance of the dots from the pose on the array [mm]; infinite without a lattice."""
+
+
+def search_planes(
+    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, plan: CameraPose, plane: int | None = None
+) -> PlaneSearch:
+    """Find the dots of every plane, with the pose of a thin lens in air; if that misses them, behind a liquid.
+
+    The search starts from one plane, or from the clearest if None. From one plane there is no search behind a liquid.
+    """
+    found = _search(signals, decoder, board, plan, plane)
+    if plane is None and found.miss_mm > _MISSED_PITCHES * decoder.optics.microlens_pitch_mm:
+        behind = _search(signals, decoder, board, plan.behind_liquid, plane)
+        if behind.miss_mm < _MET * found.miss_mm:
+            return behind
+    return found
+
+
+def _search(
+    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, plan: CameraPose, plane: int | None
+) -> PlaneSearch:
+    rectify, optics = rectifier(decoder, board, plan), decoder.optics
+    if plane is None:
+        start = first_lattice(signals, rectify, board, plan)
+    else:
+        rectified = rectify(signals.of_plane(plane), plan, board.planes_mm[plane])
+        start = lattice_of_plane(rectified, board, plan, plane)
+    if not start.regular:
+        return PlaneSearch(start, [], plan, np.inf)
+    pose = plan.fitted(start.points_mm, start.chief_mm, optics)
+    planes, pose = find_in_planes(signals, rectify, board, pose, start.sign, optics)
+    points = np.concatenate([board.points_mm(plane, MARGIN)[dots.site] for plane, dots in enumerate(planes)])
+    chief = np.concatenate([dots.chief_mm for dots in planes])
+    miss = np.median(np.hypot(*(pose.rays(points)[0] - chief).T)) if len(points) else np.inf
+    return PlaneSearch(start, planes, pose, float(miss))
+
+
+def rectifier(decoder: LightFieldDecoder, board: DotBoard, pose: CameraPose | None = None) -> Rectifier:
+    """Return the rectifier of a camera to the board with its margin.
+
+    Behind a liquid dots are astigmatic, and sharp only through a part of the pupil.
+    """
     half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
-    return Rectifier(decoder, (half_x, half_y), board.diameter_mm)
+    share = _PUPIL_PART if pose is not None and pose.is_behind_liquid else np.inf
+    return Rectifier(decoder, (half_x, half_y), board.diameter_mm, pupil_share=share)
 
 
 @dataclass(frozen=True, eq=False)

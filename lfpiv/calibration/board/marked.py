@@ -15,12 +15,12 @@ from lfpiv.calibration.board.detect import (
     FULLY_SEEN,
     PlaneDots,
     find_in_planes,
-    first_lattice,
     in_field,
     lattice_of_plane,
     lit_share,
     planes_from_middle,
     rectifier,
+    search_planes,
 )
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard
 from lfpiv.calibration.board.edges import MARGIN, sites_found
@@ -116,17 +116,10 @@ def _on_lattice(
     signals: Signals, decoder: LightFieldDecoder, board: DotBoard, plan: CameraPose, plane: int | None
 ) -> _Found:
     """Find the dots on a larger lattice with arbitrary names, starting from one plane, or from the clearest if None."""
-    search, optics = search_board(board), decoder.optics
-    rectify = rectifier(decoder, search)
-    if plane is None:
-        start = first_lattice(signals, rectify, search, plan)
-    else:
-        start = lattice_of_plane(rectify(signals.of_plane(plane), plan, search.planes_mm[plane]), search, plan, plane)
-    if not start.regular:
+    found = search_planes(signals, decoder, search_board(board), plan, plane)
+    if not found.start.regular:
         raise InputError("board: found no lattice of dots.")
-    pose = plan.fitted(start.points_mm, start.chief_mm, optics)
-    planes, pose = find_in_planes(signals, rectify, search, pose, start.sign, optics)
-    return _Found(planes=planes, pose=pose, sign=start.sign)
+    return _Found(planes=found.planes, pose=found.pose, sign=found.start.sign)
 
 
 def _name(found: _Found, decoder: LightFieldDecoder, board: DotBoard) -> Naming:
@@ -148,7 +141,7 @@ def _named(signals: Signals, decoder: LightFieldDecoder, board: DotBoard, found:
         parameters=(0.0, 0.0, 0.0, *offset.tolist(), *found.pose.parameters[6:]),
         nominal_rotation=found.pose.rotation @ turn.T,
     )
-    planes, pose = find_in_planes(signals, rectifier(decoder, board), board, pose, found.sign, decoder.optics)
+    planes, pose = find_in_planes(signals, rectifier(decoder, board, pose), board, pose, found.sign, decoder.optics)
     return _detection(planes, pose, found.sign, board, decoder)
 
 

@@ -21,6 +21,7 @@ BIN_PITCHES = 0.35
 """Size of an element of a rectified image, in microlens pitches projected on the board."""
 
 _PRIOR = {"angle_deg": 7.0, "tilt_deg": 3.0, "offset_mm": 0.7, "relative": 0.05}  # spread of rigs about their plans
+_DEPTH_PRIOR = 0.3  # spread of the logarithm of the apparent depth behind a liquid: from 0.5 (oil, 45 degrees) to 1
 _ROBUST_PITCHES = 0.5  # dots that miss the pose by more have less weight
 _USED_COVERAGE = 0.9
 _PIXELS_ACROSS = 8  # pixels across a microimage that suffice to find dots
@@ -35,7 +36,7 @@ class CameraPose:
 
     parameters: tuple[float, ...]
     """Yaw, pitch, roll about the nominal pose [rad]; offset (x, y, z) [mm]; log ratios to nominal of magnification,
-    object distance, slope."""
+    object distance, slope; behind the surface of a liquid the log ratio of apparent to true z."""
     nominal_rotation: np.ndarray
     """Nominal rotation from world to camera axes, shape (3, 3)."""
     nominal: tuple[float, float]
@@ -50,8 +51,23 @@ class CameraPose:
     @property
     def _lens(self) -> tuple[float, float, float]:
         """Return the magnification, the object distance [mm] and the factor of the slope k."""
-        ratio = np.exp(self.parameters[6:])
+        ratio = np.exp(self.parameters[6:9])
         return self.nominal[0] * ratio[0], self.nominal[1] * ratio[1], ratio[2]
+
+    @property
+    def _depth(self) -> float:
+        """Return the ratio of apparent to true z."""
+        return float(np.exp(sum(self.parameters[9:])))
+
+    @property
+    def is_behind_liquid(self) -> bool:
+        """Whether the ratio of apparent to true z is a parameter."""
+        return len(self.parameters) > 9
+
+    @property
+    def behind_liquid(self) -> CameraPose:
+        """The same camera with the ratio of apparent to true z as a further parameter."""
+        return replace(self, parameters=(*self.parameters[:9], 0.0))
 
     @property
     def rotation(self) -> np.ndarray:
@@ -63,7 +79,8 @@ class CameraPose:
     def rays(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the array positions of chief rays [mm], (n, 2), and the slopes k = ds/du of the rays, (n,)."""
         magnification, distance, slope = self._lens
-        camera = (points_mm - np.array(self.parameters[3:6])) @ self.rotation.T
+        apparent = points_mm * (1, 1, self._depth)
+        camera = (apparent - np.array(self.parameters[3:6])) @ self.rotation.T
         m = magnification * distance / (distance - camera[:, 2])
         return -m[:, None] * camera[:, :2], slope * (m - magnification)
 
@@ -89,7 +106,7 @@ class CameraPose:
         rotation, dtype = self.rotation, array_mm.dtype
         near: np.ndarray = array_mm @ (-rotation[:2] / magnification).astype(dtype)  # on the focal plane z_c = 0
         far = pupil_mm @ (slope * rotation[:2]).astype(dtype) + (distance * rotation[2]).astype(dtype)
-        z = dtype.type(z_mm - self.parameters[5])
+        z = dtype.type(z_mm * self._depth - self.parameters[5])
         share = (z - near[:, 2]) / (far[:, 2] - near[:, 2])
         offset = np.array(self.parameters[3:5], dtype)
         crossing: np.ndarray = near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + offset
@@ -112,7 +129,8 @@ class CameraPose:
             Slopes k of their rays.
         """
         angle, tilt = np.radians(_PRIOR["angle_deg"]), np.radians(_PRIOR["tilt_deg"])
-        sigma = np.array([angle, tilt, tilt] + 3 * [_PRIOR["offset_mm"]] + 3 * [_PRIOR["relative"]])
+        sigma = np.array([angle, tilt, tilt] + 3 * [_PRIOR["offset_mm"]] + 3 * [_PRIOR["relative"]] + [_DEPTH_PRIOR])
+        sigma = sigma[: len(self.parameters)]
         accuracy = _ROBUST_PITCHES * optics.microlens_pitch_mm
 
         def residuals(parameters: np.ndarray) -> np.ndarray:
