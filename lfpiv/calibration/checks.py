@@ -150,9 +150,10 @@ def check_pupil(
         raise InputError(
             f"{experiment.path}: camera {setup.name!r}: the stated rig contradicts the board images. {found} of "
             f"{expected} dots were found, and their blur at each depth is that of an aperture {fitted.pupil_scale:.2f} "
-            "times as wide as stated. Mirrored pictures or another order of the planes would not explain it: check "
-            "board.planes_mm, board.spacing_mm, focal_length_mm, magnification and f_number, and that the board images "
-            "are of this camera."
+            "times as wide as stated. In air, mirrored pictures or another order of the planes would not explain it: "
+            "check board.planes_mm, board.spacing_mm, focal_length_mm, magnification and f_number, and that the board "
+            "images are of this camera. If it looks obliquely into a liquid, check first its nominal orientation, "
+            "image_flip and the order of the planes."
         )
 
 
@@ -285,8 +286,9 @@ def check_board(errors: BoardErrors, board: DotBoard, pitch_mm: float, path: Pat
         raise InputError(
             f"{path}: board.planes_mm: expected planes that a stage moves without tilting them, found that the dots of "
             f"plane {steepest} (z = {board.planes_mm[steepest]:g} mm) fit only if it is tilted by {tilt:.1f} degrees "
-            "against the others. If the board was not tilted, rays cross a window or liquid at so steep an angle that "
-            "the calibration cannot follow them: look through it more squarely, or through a prism."
+            "against the others. If the board was not tilted, check the order of the planes, and nominal orientation "
+            "and image_flip of the cameras. If these are right, rays cross a window or liquid at so steep an angle "
+            "that the calibration cannot follow them: look through it more squarely, or through a prism."
         )
     dots = np.arange(len(board.planes_mm) * board.size)
     off = errors.points_mm(board, dots) - board.of_dots_mm(dots)

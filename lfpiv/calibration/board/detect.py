@@ -91,7 +91,7 @@ def search_planes(
     found = _search(signals, decoder, board, plan, plane)
     if plane is None and found.miss_mm > _MISSED_PITCHES * decoder.optics.microlens_pitch_mm:
         behind = _search(signals, decoder, board, plan.behind_liquid, plane)
-        if behind.miss_mm < _MET * found.miss_mm:
+        if behind.miss_mm < _MET * found.miss_mm and behind.pose.depth < 1:
             return behind
     return found
 

@@ -55,8 +55,8 @@ class CameraPose:
         return self.nominal[0] * ratio[0], self.nominal[1] * ratio[1], ratio[2]
 
     @property
-    def _depth(self) -> float:
-        """Return the ratio of apparent to true z."""
+    def depth(self) -> float:
+        """Ratio of apparent to true z: below 1 behind the surface of a liquid."""
         return float(np.exp(sum(self.parameters[9:])))
 
     @property
@@ -79,7 +79,7 @@ class CameraPose:
     def rays(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the array positions of chief rays [mm], (n, 2), and the slopes k = ds/du of the rays, (n,)."""
         magnification, distance, slope = self._lens
-        apparent = points_mm * (1, 1, self._depth)
+        apparent = points_mm * (1, 1, self.depth)
         camera = (apparent - np.array(self.parameters[3:6])) @ self.rotation.T
         m = magnification * distance / (distance - camera[:, 2])
         return -m[:, None] * camera[:, :2], slope * (m - magnification)
@@ -106,7 +106,7 @@ class CameraPose:
         rotation, dtype = self.rotation, array_mm.dtype
         near: np.ndarray = array_mm @ (-rotation[:2] / magnification).astype(dtype)  # on the focal plane z_c = 0
         far = pupil_mm @ (slope * rotation[:2]).astype(dtype) + (distance * rotation[2]).astype(dtype)
-        z = dtype.type(z_mm * self._depth - self.parameters[5])
+        z = dtype.type(z_mm * self.depth - self.parameters[5])
         share = (z - near[:, 2]) / (far[:, 2] - near[:, 2])
         offset = np.array(self.parameters[3:5], dtype)
         crossing: np.ndarray = near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + offset
