@@ -9,17 +9,18 @@ nodes. Conjugate gradients, preconditioned by the light near each node, solve fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from lfpiv.joint.conjugate_gradients import conjugate_gradients
 from lfpiv.joint.model import JointModel
-from lfpiv.reconstruction.ordered_subsets import Subset
+from lfpiv.reconstruction.image_preparation import PreparedImage
+from lfpiv.reconstruction.ordered_subsets import Subset, whole_subset
 from lfpiv.weights.operator import Weights
-from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.transport import Transport
+from lfpiv_kernels.transfer import to_device, to_host
 
 ROUGH = 0.3
 """Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel."""
@@ -37,14 +38,17 @@ SECOND_DIFFERENCES = 18.0
 class Residual:
     """Images of a model beside the recorded ones."""
 
-    misfit: float
-    """Sum of the misfits of both frames [counts]."""
+    volumes: tuple[np.ndarray, np.ndarray]
+    """Volume of each frame, shape (z, y, x), float32."""
     exponents: tuple[np.ndarray, np.ndarray]
     """G' e_f of each frame, shape (z, y, x), float32."""
-    curvatures: tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
-    """gain^2 / (P + b) of the pixels of each frame's cameras; 0 for pixels that do not count."""
     of_frame: tuple[tuple[float, float], tuple[float, float]]
     """||I - P|| / ||I|| and misfit [counts] of each frame."""
+
+    @property
+    def misfit(self) -> float:
+        """Sum of the misfits of both frames [counts]."""
+        return self.of_frame[0][1] + self.of_frame[1][1]
 
 
 @dataclass(frozen=True)
@@ -79,26 +83,40 @@ class RayPart:
             if sets
         }
 
-    def share(self, images: dict[str, np.ndarray]) -> float:
-        """Return the part of some images that lies in pixels which see these rays only."""
-        whole = sum(float(image.sum(dtype=np.float64)) for image in images.values())
-        own = sum(float(images[name].reshape(-1)[at].sum(dtype=np.float64)) for name, at in self._pixels.items())
+    def share(self, images: Mapping[str, PreparedImage]) -> float:
+        """Return the part of the light of a frame's images that lies in pixels which see these rays only."""
+        whole = sum(float(one.image.sum(dtype=np.float64)) for one in images.values())
+        own = sum(float(images[name].image[at].sum(dtype=np.float64)) for name, at in self._pixels.items())
         return own / whole
 
-    def normal(self, volume: np.ndarray, curvatures: dict[str, np.ndarray]) -> np.ndarray:
+    def curvatures(self, volume: np.ndarray, images: Mapping[str, PreparedImage]) -> dict[str, np.ndarray]:
+        """Return gain^2 / (P + b) of the pixels that see these rays only; 0 for pixels that do not count."""
+        found = {}
+        for name, seen in self._seen(volume).items():
+            one, at = images[name], self._pixels[name]
+            gain = self.weights.gain(name)[at] * np.float32(one.camera_gain)
+            expected = seen * gain
+            counts = (one.image[at] > 0) | (expected > 0)
+            found[name] = np.where(counts, gain**2 / np.where(counts, expected + np.float32(one.floor), 1), 0)
+        return found
+
+    def normal(self, volume: np.ndarray, curvatures: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return sum over the pixels of w curvature (W volume), shape (z, y, x), float32."""
         stored = self.weights.stored
-        flat, back = stored.store(volume), np.zeros(stored.size, np.float32)
-        for name, at in self._pixels.items():
-            projector, gain = self.weights.projector(name), self.weights.gain(name)
-            image, part = np.zeros(gain.size, np.float32), np.empty(gain.size, np.float32)
-            for ray_set in self._sets[name]:
-                seen = projector.see_only(ray_set)
-                image[seen] = projector.project(flat, part, ray_set)[seen]
-            weighted = np.zeros_like(image)
-            weighted[at] = image[at] * gain[at] ** 2 * curvatures[name].reshape(-1)[at]
-            projector.back_project(weighted, back, *(one for one in self._sets[name] if one != ALL))
+        back = np.zeros(stored.size, np.float32)
+        for name, seen in self._seen(volume).items():
+            weighted = np.zeros(self.weights.gain(name).size, np.float32)
+            weighted[self._pixels[name]] = seen * curvatures[name]
+            self.weights.projector(name).back_project(weighted, back, *self._sets[name])
         return stored.restore(back)
+
+    def _seen(self, volume: np.ndarray) -> dict[str, np.ndarray]:
+        """Return W volume of the pixels that see these rays only."""
+        flat, seen = self.weights.stored.store(volume), {}
+        for name, at in self._pixels.items():
+            image = np.empty(self.weights.gain(name).size, np.float32)
+            seen[name] = self.weights.projector(name).project(flat, image, *self._sets[name])[at]
+        return seen
 
 
 class DisplacementSteps:
@@ -119,29 +137,25 @@ class DisplacementSteps:
 
     def residual(self, light: np.ndarray, transports: tuple[Transport, Transport]) -> Residual:
         """Compare the images of the model with the recorded ones."""
-        model, exponents, curvatures, figures = self.model, [], [], []
-        for number, (frame, transport) in enumerate(zip(model.frames, transports, strict=True)):
-            projected = model.weights(model.volume(number, light, transport))
-            logs, curves, misfit, squares, norm = {}, {}, 0.0, 0.0, 0.0
-            for name, one in frame.images.items():
-                gain, floor = np.float32(one.camera_gain), np.float32(one.floor)
-                expected = projected[name] * gain
-                image = one.image.reshape(expected.shape)
-                counts = (image > 0) | (expected > 0)
-                logarithm = np.where(counts, np.log((image + floor) / (expected + floor)), 0).astype(np.float32)
-                terms = np.where(counts, image - expected - (expected + floor) * logarithm, 0)
-                misfit += float(terms.sum(dtype=np.float64))
-                squares += float(np.square(image - expected, dtype=np.float64).sum())
-                norm += float(np.square(image, dtype=np.float64).sum())
-                logs[name] = logarithm * gain
-                curves[name] = np.where(counts, gain**2 / (expected + floor), 0).astype(np.float32)
-            exponents.append(model.sieved(model.weights.T(logs)))
-            curvatures.append(curves)
-            figures.append((float(np.sqrt(squares / norm)), misfit))
-        first, second = figures
-        return Residual(
-            first[1] + second[1], (exponents[0], exponents[1]), (curvatures[0], curvatures[1]), (first, second)
+        (first, e_first, of_first), (second, e_second, of_second) = (
+            self._residual(number, light, transport) for number, transport in enumerate(transports)
         )
+        return Residual((first, second), (e_first, e_second), (of_first, of_second))
+
+    def _residual(
+        self, frame: int, light: np.ndarray, transport: Transport
+    ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+        """Return the volume of a frame, its G' e_f, and its residual and misfit."""
+        model, prepared = self.model, self.model.frames[frame]
+        volume, equations = model.volume(frame, light, transport), prepared.equations
+        with equations.locked():
+            equations.begin()
+            rays = whole_subset(len(prepared.images)).parts
+            exponent = to_host(equations.exponent_of(rays, to_device(model.weights.stored.store(volume), float))).copy()
+            misfit = equations.measured()
+        norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
+        back = model.sieved(model.weights.stored.restore(exponent))
+        return volume, back, (float(np.sqrt(misfit.squares / norm)), misfit.divergence)
 
     def gradient(self, light: np.ndarray, transports: tuple[Transport, Transport], residual: Residual) -> np.ndarray:
         """Return the derivative of the misfit by the nodes."""
@@ -156,13 +170,17 @@ class DisplacementSteps:
         """Return the map from a change of the nodes to a change of the gradient."""
         model = self.model
         own = [model.light_of(number, light) for number in range(2)]
-        shares = [self._part.share({name: one.image for name, one in frame.images.items()}) for frame in model.frames]
+        shares = [self._part.share(frame.images) for frame in model.frames]
+        curvatures = [
+            self._part.curvatures(volume, frame.images)
+            for volume, frame in zip(residual.volumes, model.frames, strict=True)
+        ]
 
         def change(nodes: np.ndarray) -> np.ndarray:
             direction, total = model.field.values(nodes), np.zeros((3, *light.shape), np.float32)
             for number, transport in enumerate(transports):
                 moved = model.sieved(transport.push_change(own[number], direction))
-                back = self._part.normal(moved, residual.curvatures[number]) / np.float32(shares[number])
+                back = self._part.normal(moved, curvatures[number]) / np.float32(shares[number])
                 total += transport.pull_slope(model.sieved(back), own[number])
             return model.field.adjoint(total)
 

@@ -100,12 +100,16 @@ class RayProjector:
         """Return the largest weight of a ray."""
         raise NotImplementedError
 
-    def project(self, volume: Values, out: Given, ray_set: int = ALL) -> Given:
-        """Write the image of `volume`, shape (voxel,), by the rays of a set to `out`, shape (pixel,). Return `out`."""
+    def project(self, volume: Values, out: Given, *ray_sets: int) -> Given:
+        """Write the image of `volume`, shape (voxel,), by the rays of some sets to `out`, shape (pixel,). Return `out`.
+
+        All rays count where no set is given.
+        """
         with self.reserved():
-            if ray_set != ALL:
+            if ray_sets and ray_sets != (ALL,):
                 self.rays.zero_()
-            self.scatter(volume, ray_set)
+            for ray_set in ray_sets or (ALL,):
+                self.scatter(volume, ray_set)
             on_device = isinstance(out, wp.array)
             image = out if on_device else empty(out.size) if runtime.device().form == "gpu" else to_device(out, float)
             image.zero_()  # pixels that no voxel lights
