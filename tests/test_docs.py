@@ -288,6 +288,17 @@ def test_every_extra_is_explained():
     assert set(extras) <= set(re.findall(r"^\| `([\w-]+)`", section, re.MULTILINE))
 
 
+def test_the_conda_recipe_requires_what_the_package_requires():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    named = {"opencv-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}  # by conda-forge
+    parts = [re.match(r"([\w-]+)(.*?)(;.*)?$", text) for text in project["dependencies"]]
+    required = {f"{named.get(part[1], part[1])} {part[2]}" for part in parts} | {f"python {project['requires-python']}"}
+    recipe = (ROOT / "recipe" / "meta.yaml").read_text("utf-8")
+    listed = recipe.partition("  run:\n")[2].partition("\n\n")[0]
+    assert {line.strip(" -") for line in listed.splitlines()} == required
+    assert f'version = "{lfpiv.__version__}"' in recipe
+
+
 def test_every_public_name_has_its_reference():
     pages = "".join(page.read_text("utf-8") for page in PAGES.values())
     listed = re.findall(r"^\.\. auto(?:function|class|exception|module):: (\S+)", pages, re.MULTILINE)

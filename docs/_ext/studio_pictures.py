@@ -1,7 +1,8 @@
 """Take the pictures of the studio that the pages show: ``python docs/_ext/studio_pictures.py FOLDER``.
 
-FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. A run into a folder "again" is
-begun. Each tab is seen by headless Chromium, 1440 pixels wide in light and dark, and 390 pixels wide in light.
+FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. A run into a folder "again" beside the
+experiment is begun anew. Each tab is seen by headless Chromium, 1440 pixels wide in light and dark, and 390 pixels
+wide in light.
 """
 
 import shutil
@@ -25,8 +26,8 @@ TABS = {
     "results": ("r_chart", {"r_arrows": True}),
 }
 """Name of a tab -> a value of the state that is there when it is drawn, and values that are set for the picture."""
-CLICKED = {"preview": ("t-try", "t_after"), "runs": ("p-start", "p_stages")}
-"""Name of a tab -> a button that is clicked at first, and a value of the state that is there after that."""
+CLICKED = {"preview": ("t-try", "t_after", 0), "runs": ("p-start", "p_stages", 2)}
+"""Name of a tab -> a button that is clicked at first, a value of the state, and the length that it passes."""
 LONGEST_S, SETTLED_S = 150.0, 4.0
 """Longest time until a tab is drawn, and time after that until its picture is taken [s]."""
 
@@ -35,6 +36,8 @@ def take(folder: str) -> None:
     """Take all pictures."""
     command = [sys.executable, "-m", "lfpiv", "studio", folder, "--no-browser"]
     OUT.mkdir(parents=True, exist_ok=True)
+    for earlier in Path(folder).rglob("again/.run.log"):
+        shutil.rmtree(earlier.parent)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             address = server.stdout.readline().split()[1]
@@ -66,12 +69,22 @@ def see(driver: webdriver.Chrome, address: str) -> None:
                 wait(driver, f"{opened}; const v = trame.state.get('{ready}'); return !!v && v.length !== 0")
                 for name, value in values.items():
                     driver.execute_script("trame.state.set(arguments[0], arguments[1])", name, value)
-                button, shown = CLICKED.get(tab, ("", ""))
+                button, shown, parts = CLICKED.get(tab, ("", "", 0))
                 if button and not driver.execute_script(f"return (trame.state.get('{shown}') || []).length"):
-                    driver.find_element("id", button).click()
-                    wait(driver, f"return trame.state.get('{shown}').length > 0")
+                    click(driver, button)
+                    wait(driver, f"return trame.state.get('{shown}').length > {parts}")
+                    if tab == "preview":  # and once more, changed
+                        driver.execute_script("trame.state.set('t_correlation_overlap', 0.5)")
+                        click(driver, button)
+                        wait(driver, "return trame.state.get('t_before') !== trame.state.get('t_after')")
                 time.sleep(SETTLED_S)
                 driver.save_screenshot(str(OUT / f"{tab}_{size}_{theme}.png"))
+
+
+def click(driver: webdriver.Chrome, button: str) -> None:
+    """Click a button as soon as it can be clicked."""
+    wait(driver, f"const b = document.getElementById('{button}'); return !!b && b.offsetParent && !b.disabled")
+    driver.find_element("id", button).click()
 
 
 def wait(driver: webdriver.Chrome, script: str) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv import files
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.report import background, markup, overview, pairs, tracks, volumes
+from lfpiv.report import background, markup, overview, pairs, raw_image, tracks, volumes
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import vectors as vector_section
 from lfpiv.report.summary import Summary
@@ -70,11 +70,12 @@ def write_report(
     figures = Summary.model_validate(summary)
     recording = experiment.recording
     every = pairs.section(figures.pairs, figures.failed, figures.finished_count, recording) if figures.pairs else ""
+    raw = raw_image.figure(experiment, figures.pairs[0].number) if figures.pairs else ""
     sections = {
         "vectors": vector_section.section(vectors, recording, figures.damping),
         "volumes": volumes.section(figures.pairs, vectors, recording) if vectors else "",
         "pairs": every + tracks.section(figures.tracks, path.parent) if figures.pairs else "",
-        "run": overview.run_facts(experiment, figures),
+        "run": overview.run_facts(experiment, figures) + raw,
         "calibration": calibration_section.section(experiment, calibration, figures.calibration),
         "background": background.section(experiment, calibration),
         "time": overview.timings(figures, recording.noun),

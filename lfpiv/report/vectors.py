@@ -99,7 +99,8 @@ def _slice_view(
     profile, numbers = profile_panel(fields, kinds, view, flow.voxel_velocity(first) * scale.factor)
     still = markup.figure(
         [slice_panel(fields, kinds, view.normal, place, view.quantity, "arrows"), profile],
-        f"{name.capitalize()}: {label} and the velocity in the best slice, and the velocity along a line through it "
+        f"{name.capitalize()}: {label} and the velocity in the slice with most vorticity (in the middle where none "
+        "stands out), and the velocity along a line through it "
         "(bands: ± 2 standard deviations). White arrows and open marks were replaced after validation; hatched cells "
         "are masked.",
         numbers,
@@ -197,8 +198,8 @@ def _vorticity(name: str, fields: xr.Dataset, kinds: dict[str, Quantity], view: 
     """Draw streamlines in three slices, and the components of the vorticity where there are any in the best one."""
     order = [view.normal, *(axis for axis in "zyx" if axis != view.normal)]
     panels = [slice_panel(fields, kinds, axis, view.place[axis], "speed", "streamlines") for axis in order]
-    text = f"{name.capitalize()}: speed in the best slice and in those across it, with the streamlines of the velocity "
-    text += "in each slice."
+    text = f"{name.capitalize()}: speed in the slice with most vorticity and in those across it, with the "
+    text += "streamlines of the velocity in each slice."
     parts = ["<h3>Streamlines</h3>", markup.figure(panels, text), "<h3>Vorticity</h3>"]
     curl = [f"vorticity_{axis}" for axis in "xyz" if f"vorticity_{axis}" in fields]
     if not curl:
@@ -206,7 +207,7 @@ def _vorticity(name: str, fields: xr.Dataset, kinds: dict[str, Quantity], view: 
     place = view.place[view.normal]
     panels = [slice_panel(fields, kinds, view.normal, place, quantity, "none") for quantity in curl]
     text = (
-        f"{name.capitalize()}: components of the vorticity in the best slice, differences of neighbours, one-sided at "
+        f"{name.capitalize()}: components of the vorticity in this slice, differences of neighbours, one-sided at "
         "the border."
     )
     return "".join([*parts, markup.figure(panels, text)])

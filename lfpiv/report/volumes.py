@@ -79,8 +79,10 @@ def _projection_figure(pair: int, first: xr.Dataset, recording: Recording) -> st
     )
     return markup.figure(
         shown,
-        f"Brightest voxel along each axis, {name}. Particles should be round across the cameras' mean line of "
-        "sight, usually z; along it they are longer, the more so the smaller the angle between the cameras.",
+        f"Brightest voxel along each axis, {name}. An intensity is about the light of a voxel in all pixels "
+        "of a camera together, so it exceeds the largest count of a pixel. Particles of more than one voxel should be "
+        "round across the cameras' mean line of sight, usually z; along it they are longer, "
+        "the more so the smaller the angle between the cameras.",
         table,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import trame_client.widgets.html as html
+from trame.widgets import vtk
 from trame.widgets import vuetify3 as v3
 
 DIGITS = 5
@@ -41,3 +42,12 @@ def button(label: str, click: Any, icon: str = "", **more: Any) -> None:
     """Show a button."""
     options = {"prepend_icon": icon} if icon else {}
     v3.VBtn(label, click=click, size="small", variant="tonal", **options, **more)
+
+
+def picture(plotter: Any, name: str, turned: Any = None) -> Any:
+    """Show what a plotter draws; `turned` is called when it was turned by hand."""
+    events = {"interactor_events": (f"{name}_events", ["Animation", "EndAnimation"])} if turned else {}
+    events |= {"Animation": turned, "EndAnimation": turned} if turned else {}
+    return vtk.VtkRemoteView(
+        plotter.render_window, ref=name, interactive_ratio=0.7, interactive_quality=70, still_quality=95, **events
+    )

@@ -9,7 +9,6 @@ import functools
 from typing import Any
 
 import cv2
-import numpy as np
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 
@@ -36,29 +35,26 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
         return reply
     if tuple(window.GetSize()) != (columns, rows):
         window.SetSize(columns, rows)
+        for renderer in window.GetRenderers():  # in a narrow view the sides stay in sight
+            renderer.GetActiveCamera().SetUseHorizontalViewAngle(columns < rows)
     window.Render()
     window.lfpiv_drawn = drawn
-    picture = encoded(pixels(window), int(options.get("quality", 95)))
+    picture = _encoded(window, int(options.get("quality", 95)))
     return reply | {"image": picture, "memsize": len(picture)}
 
 
 def _changed(window: Any) -> int:
     """Return when what a window shows was changed last, in VTK's count of changes."""
-    times = [window.GetMTime()]
-    for renderer in window.GetRenderers():
-        times += [renderer.GetMTime(), renderer.GetActiveCamera().GetMTime()]
-        times += [prop.GetRedrawMTime() for prop in renderer.GetViewProps()]
-    return int(max(times))
+    renderers = list(window.GetRenderers())
+    seen = (window, *renderers, *(renderer.GetActiveCamera() for renderer in renderers))
+    props = (prop.GetRedrawMTime() for renderer in renderers for prop in renderer.GetViewProps())
+    return int(max((*(item.GetMTime() for item in seen), *props)))
 
 
-def pixels(window: Any) -> np.ndarray:
-    """Return the pixels of a rendered window, shape (rows, columns, 3), red first."""
+def _encoded(window: Any, quality: int) -> bytes:
+    """Return the pixels of a rendered window as JPEG."""
     columns, rows = window.GetSize()
     values = vtkUnsignedCharArray()
     window.GetPixelData(0, 0, columns - 1, rows - 1, 0, values, 0)
-    return vtk_to_numpy(values).reshape(rows, columns, 3)[::-1]
-
-
-def encoded(picture: np.ndarray, quality: int) -> bytes:
-    """Return a picture as JPEG."""
-    return cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    picture = vtk_to_numpy(values).reshape(rows, columns, 3)[::-1, :, ::-1]  # type: ignore[no-untyped-call]
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -82,6 +82,8 @@ class Picture:
         """Return a picture without layers, drawn off the screen."""
         plotter = pv.Plotter(off_screen=True, window_size=list(size))
         plotter.render_window.SetMultiSamples(0)  # twice to four times as slow in software
+        plotter.camera.SetUseHorizontalViewAngle(size[0] < size[1])
+        plotter.camera.SetWindowCenter(0.0, -0.08)  # room for the colour scale below
         return cls(plotter)
 
     def show(self, whole: pv.ImageData, look: Look, clouds: dict[str, pv.PolyData], title: str) -> None:
@@ -95,9 +97,9 @@ class Picture:
         ink, paint = INK[look.theme], {"cmap": look.colours, "clim": list(limits), "scalars": look.colour}
         shade = (look.colour, look.colours, limits, look.theme, title)
         bar = {
-            "title": title, "color": ink, "vertical": True, "fmt": "%.3g", "position_x": 0.86, "position_y": 0.2,
-            "width": 0.05, "height": 0.6, "n_labels": 5, "title_font_size": 15, "label_font_size": 13,
-            "unconstrained_font_size": True,
+            "title": f"{title}\n", "color": ink, "vertical": False, "fmt": "%.3g", "n_labels": 5,
+            "position_x": 0.2, "position_y": 0.02, "width": 0.6, "height": 0.08,
+            "title_font_size": 15, "label_font_size": 13, "unconstrained_font_size": True,
         }  # fmt: skip
         for axis, at in zip("xyz", look.slices, strict=True):
             self._layer(
@@ -158,7 +160,7 @@ class Picture:
         plotter.add_mesh(grid.outline(), color=ink, name="outline", reset_camera=False, render=False)
         plotter.remove_bounds_axes()
         plotter.show_bounds(
-            bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=9, n_xlabels=4,
+            bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=11, n_xlabels=4,
             n_ylabels=4, n_zlabels=3, location="outer", grid=False, ticks="outside", fmt="%.3g", use_3d_text=False,
             render=False,
         )  # fmt: skip

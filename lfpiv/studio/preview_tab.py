@@ -13,12 +13,12 @@ import numpy as np
 import pyvista as pv
 import tomlkit
 import trame_client.widgets.html as html
-from trame.widgets import vtk as vtk_widgets
 
 import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.quantities import duration
 from lfpiv.studio import controls, layers, look
+from lfpiv.studio.field_names import title_of
 from lfpiv.studio.session import Session
 
 FEW_VOXELS = 60_000
@@ -162,7 +162,7 @@ class Preview:
                 colour=self.state.t_colour, limits=limits, slices=(None, None, at), theme=self.state.theme,
                 arrows=max(1, round(max(grid.dimensions) / 14)), hide_replaced=False, replaced=True,
             )  # fmt: skip
-            picture.show(grid, shown, {}, self.state.t_colour)
+            picture.show(grid, shown, {}, title_of(self.state.t_colour))
             view.update()
 
     def keep(self) -> None:
@@ -194,7 +194,9 @@ class Preview:
                 self.state.t_busy = ""
         with self.state:
             times, memory = answer["time"], answer["memory_bytes"]
-            durations = {name: value for name, value in times.items() if isinstance(value, int | float)}
+            durations = {
+                name.removesuffix("_s"): value for name, value in times.items() if isinstance(value, int | float)
+            }
             needs = {name: value for name, value in memory.items() if value}
             self.state.t_plan = [
                 *(f"{name.replace('_', ' ')}: {duration(value)}" for name, value in durations.items()),
@@ -231,16 +233,13 @@ class Preview:
                 html.H3("Shown")
                 controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01)
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
-            with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
+            with html.Div(classes="lf-main lf-double"), html.Div(classes="lf-views"):
                 self.views = tuple(self._view(number, name) for number, name in enumerate(("before", "after")))
 
     def _view(self, number: int, name: str) -> Any:
         with html.Div(classes="lf-view"):
             html.Div(f"{name}: {{{{ t_{name} || 'nothing yet' }}}}", classes="lf-name", id=f"t-{name}")
-            return vtk_widgets.VtkRemoteView(
-                self.pictures[number].plotter.render_window, ref=f"preview_{number}", interactive_ratio=0.7,
-                interactive_quality=70, interactor_events=("t_events", ["EndAnimation"]), EndAnimation=self._linked,
-            )  # fmt: skip
+            return controls.picture(self.pictures[number].plotter, f"preview_{number}", self._linked)
 
     def _linked(self, *_: Any, **__: Any) -> None:
         for view in self.views:

@@ -3,37 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import tempfile
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pyvista as pv
 import trame_client.widgets.html as html
 import xarray as xr
-from trame.widgets import vtk as vtk_widgets
-from trame.widgets import vuetify3 as v3
 
 import lfpiv
 from lfpiv.errors import InputError
-from lfpiv.results import tables
 from lfpiv.studio import charts, controls, layers, look
+from lfpiv.studio.field_names import LABELS, SURFACES, title_of
+from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
-LABELS = {
-    "speed": ("speed", "m/s"), "u": ("u", "m/s"), "v": ("v", "m/s"), "w": ("w", "m/s"),
-    "vorticity_magnitude": ("vorticity", "1/s"), "vorticity_x": ("vorticity x", "1/s"),
-    "vorticity_y": ("vorticity y", "1/s"), "vorticity_z": ("vorticity z", "1/s"), "q_criterion": ("Q", "1/s²"),
-    "divergence": ("divergence", "1/s"), "pressure": ("pressure", "Pa"), "uncertainty": ("uncertainty", "voxel"),
-    "peak_ratio": ("peak ratio", ""), "correlation": ("correlation", ""), "valid": ("valid", ""),
-}  # fmt: skip
-"""Fields in the order of the lists, what people call them, and their units. Others follow by their names."""
-SURFACES = ("speed", "vorticity_magnitude", "q_criterion", "pressure", "u", "v", "w", "uncertainty")
-"""Fields that have isosurfaces."""
 COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
-FRAMES_PER_S = 8
-"""Pictures of a film per second of a series; a turn takes 60 pictures at three times the rate."""
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "oblique"}
 
 
@@ -46,6 +31,7 @@ class Results:
         self.grids: dict[tuple[str, str], pv.ImageData] = {}
         self.pictures = (look.Picture.empty(), look.Picture.empty())
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
+        self.cloud, self.cloud_of = {}, ("", None)  # type: tuple[dict[str, pv.PolyData], tuple[str, int | None]]
         self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
         self.state.update(
             {
@@ -56,7 +42,6 @@ class Results:
                 "r_every": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
                 "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
                 "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
-                "r_script": "", "r_script_shown": False,
             }
         )  # fmt: skip
         watched = """
@@ -67,11 +52,7 @@ class Results:
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
         self.state.change("r_playing")(lambda **_: session.start(self._play()))
-        server = session.server
-        server.trigger("r_png")(self.png)
-        server.trigger("r_film")(self.film)
-        server.trigger("r_vti")(self.vti)
-        server.trigger("r_csv")(self.csv)
+        self.files = Files(self)
         session.listeners.append(self._opened)
         self._panel()
 
@@ -80,6 +61,7 @@ class Results:
         if what != "results":
             return
         self.data.clear()
+        self.cloud_of = ("", None)
         self.grids.clear()
         self.charted = ()
         places = self.session.places
@@ -123,14 +105,18 @@ class Results:
         return self.grids[key]
 
     def clouds(self, folder: str, moment: str) -> dict[str, pv.PolyData]:
-        """Return particles and tracks that are asked for."""
-        found, number = {}, int(moment) if moment.isdigit() else None
-        if self.state.r_particles and number is not None:
-            table = lfpiv.open_particles(folder, pairs=(number, number + 1))
-            found["particles"] = layers.points_of(table, ("x", "y", "z"))
-        if self.state.r_tracks:
-            found["tracks"] = layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
-        return found
+        """Return particles and tracks that are asked for; the last ones are kept."""
+        number = int(moment) if moment.isdigit() else None
+        wanted = [name for name in ("particles", "tracks") if self.state[f"r_{name}"]]
+        if self.cloud_of != (folder, number):
+            self.cloud_of, self.cloud = (folder, number), {}
+        for name in wanted:
+            if name == "tracks" and name not in self.cloud:
+                self.cloud[name] = layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
+            elif number is not None and name not in self.cloud:
+                table = lfpiv.open_particles(folder, pairs=(number, number + 1))
+                self.cloud[name] = layers.points_of(table, ("x", "y", "z"))
+        return {name: self.cloud[name] for name in wanted if name in self.cloud}
 
     def _first_look(self) -> None:
         """Choose places, levels and lists that suit the fields."""
@@ -191,52 +177,52 @@ class Results:
         with self.state:
             self.session.guarded(self.draw)()
 
-    def draw(self) -> None:
-        """Draw what the state asks for, in both pictures if two runs are compared."""
-        if self.session.results is None:
-            return
-        wanted = self.wanted
-        folders = [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
-        for folder, picture, view in zip(folders, self.pictures, self.views, strict=False):
+    @property
+    def folders(self) -> list[str]:
+        """Return the folders that are seen: the results, and those they are compared with."""
+        return [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
+
+    def show(self, wanted: look.Look) -> None:
+        """Change the pictures to a look, without sending them."""
+        for folder, picture in zip(self.folders, self.pictures, strict=False):
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
                 raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
             picture.show(grid, wanted, self.clouds(folder, wanted.moment), title_of(wanted.colour))
+
+    def draw(self) -> None:
+        """Draw what the state asks for, in both pictures if two runs are compared."""
+        if self.session.results is None:
+            return
+        wanted, folders = self.wanted, self.folders
+        self.show(wanted)
+        for view in self.views[: len(folders)]:
             view.update()
-        low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
         if self.state.r_own:
+            low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
             self.state.r_low, self.state.r_high = float(f"{low:.4g}"), float(f"{high:.4g}")
         self._chart(wanted, folders)
 
     def _chart(self, wanted: look.Look, folders: list[str]) -> None:
         """Draw the histogram of the colour's field, or profiles along the axes through the planes' places."""
         kind = self.state.r_chart_kind
-        lines: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        place = () if kind == "histogram" else (self.state.r_x, self.state.r_y, self.state.r_z)
-        key = (kind, place, wanted.moment, wanted.colour, wanted.hide_replaced, wanted.uncertainty, *folders)
+        place = [] if kind == "histogram" else [self.state.r_x, self.state.r_y, self.state.r_z]
+        key = (kind, *place, wanted.moment, wanted.colour, wanted.hide_replaced, wanted.uncertainty, *folders)
         if key == self.charted:
             return
-        self.charted = key
+        self.charted, lines = key, {}
         for folder, picture in zip(folders, self.pictures, strict=False):
             grid = picture.drawn["trusted"]
-            values = grid[wanted.colour]
             if kind == "histogram":
-                lines[Path(folder).name] = charts.histogram(values)
+                lines[Path(folder).name] = charts.histogram(grid[wanted.colour])
             else:
-                block = values.reshape(grid.dimensions[::-1])
-                index = [
-                    int(np.clip(round((self.state[f"r_{axis}"] - low) / step), 0, n - 1))
-                    for axis, low, step, n in zip("xyz", grid.origin, grid.spacing, grid.dimensions, strict=True)
-                ]
-                number = "xyz".index(kind)
-                places = [index[2], index[1], index[0]]
-                places[2 - number] = slice(None)  # type: ignore[call-overload]
-                along = grid.origin[number] + grid.spacing[number] * np.arange(grid.dimensions[number])
-                lines[Path(folder).name] = (along, block[tuple(places)])
-        if kind == "histogram":
-            self.state.r_chart = charts.chart(lines, title_of(wanted.colour), "number of vectors")
-        else:
-            self.state.r_chart = charts.chart(lines, f"{kind} [mm]", title_of(wanted.colour))
+                number, ends = "xyz".index(kind), np.array([place, place], float)
+                ends[:, number] = grid.bounds[2 * number : 2 * number + 2]
+                slim = layers.slim(grid, wanted.colour)
+                line = slim.sample_over_line(*ends, resolution=max(1, grid.dimensions[number] - 1))
+                lines[Path(folder).name] = (line.points[:, number], line[wanted.colour])
+        titles = [title_of(wanted.colour), "number of vectors"]
+        self.state.r_chart = charts.chart(lines, *(titles if kind == "histogram" else [f"{kind} [mm]", titles[0]]))
 
     def _step_to(self, r_step: int, **_: Any) -> None:
         if self.session.results is not None and self.state.r_numbers:
@@ -247,7 +233,7 @@ class Results:
         while self.state.r_playing:
             with self.state:
                 self.state.r_step = (int(self.state.r_step) + 1) % max(1, self.state.r_numbers)
-            await asyncio.sleep(1 / FRAMES_PER_S)
+            await asyncio.sleep(1 / FRAMES_PER_S["series"])
 
     def look_along(self, name: str) -> None:
         """Turn the camera to a view by its name, or by steps."""
@@ -269,100 +255,21 @@ class Results:
             picture.plotter.renderer.ResetCameraClippingRange()
             view.update()
 
-    def png(self) -> Any:
-        """Return the picture as PNG, side by side where two runs are compared."""
-        images = [picture.image() for picture in self.pictures[: 2 if self.state.r_other else 1]]
-        rows = min(image.shape[0] for image in images)
-        whole = np.hstack([image[:rows] for image in images])[..., ::-1]
-        return self._attached(bytes(cv2.imencode(".png", np.ascontiguousarray(whole))[1]))
-
-    async def film(self, kind: str) -> Any:
-        """Return a film of the series, or of one turn, as MP4."""
-        import imageio_ffmpeg
-
-        plotter, start = self.pictures[0].plotter, self.state.r_step
-        count = 60 if kind == "turn" else self.state.r_numbers
-        with tempfile.TemporaryDirectory() as folder:
-            path, writer = Path(folder) / "film.mp4", None
-            for number in range(count):
-                if kind == "turn":
-                    plotter.camera.Azimuth(360 / count)
-                else:
-                    self.state.r_moment = self.state.r_moments[number]["value"]
-                    self.draw()
-                image = self.pictures[0].image()
-                image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
-                if writer is None:
-                    fps = 20 if kind == "turn" else FRAMES_PER_S
-                    writer = imageio_ffmpeg.write_frames(
-                        str(path), image.shape[1::-1], fps=fps, macro_block_size=2, quality=8
-                    )
-                    writer.send(None)
-                    size = image.shape
-                if image.shape == size:
-                    writer.send(image)
-                await asyncio.sleep(0)
-            if writer is not None:
-                writer.close()
-            content = path.read_bytes()
-        self._step_to(start)
-        return self._attached(content)
-
-    def vti(self) -> Any:
-        """Return the fields of the moment as VTK image data."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "field.vti"
-            self.grid(str(self.session.results), self.wanted.moment).save(path)
-            return self._attached(path.read_bytes())
-
-    def csv(self) -> Any:
-        """Return the vectors of the moment as a table, a row each."""
-        vectors = layers.field_at(self.open(str(self.session.results)), self.wanted.moment)
-        with tempfile.TemporaryDirectory() as folder:
-            tables.write_vectors(vectors.load(), Path(folder) / "field.csv")
-            return self._attached((Path(folder) / "field.csv").read_bytes())
-
-    def copy(self) -> None:
-        """Show the script that draws what is seen."""
-        plotter = self.pictures[0].plotter
-        camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
-        width, height = plotter.window_size
-        self.state.r_script = look.script(
-            self.wanted, str(self.session.results), title_of(self.state.r_colour), camera, (width, height)
-        )
-        self.state.r_script_shown = True
-
-    def _attached(self, content: bytes) -> Any:
-        return self.session.server.protocol.addAttachment(content)
-
     def _panel(self) -> None:
         with html.Div(classes="lf-split"):
             with html.Div(classes="lf-panel"):
                 self._moment_controls()
                 self._layer_controls()
                 self._chart_controls()
-                self._out_controls()
+                self._view_controls()
+                self.files.buttons()
             with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
                 self.views = (self._view(0, "results_name", "true"), self._view(1, "r_other", "!!r_other"))
-        with v3.VDialog(v_model=("r_script_shown",), max_width=900):
-            with v3.VCard(title="This picture as Python", classes="pa-3"):
-                html.Textarea(
-                    v_model=("r_script",), readonly=True, rows=18, id="r-script", aria_label="script",
-                    style="width:100%;font-family:monospace;font-size:12px",
-                )  # fmt: skip
-                with html.Div(classes="lf-buttons"):
-                    controls.button("Copy", "window.navigator.clipboard.writeText(r_script)", "mdi-content-copy")
-                    controls.button("Close", "r_script_shown = false")
 
     def _view(self, number: int, name: str, shown: str) -> Any:
         with html.Div(classes="lf-view", v_show=shown):
             html.Div(f"{{{{ {name} }}}}", classes="lf-name")
-            return vtk_widgets.VtkRemoteView(
-                self.pictures[number].plotter.render_window, ref=f"results_{number}", interactive_ratio=0.7,
-                interactive_quality=70, still_quality=95,
-                interactor_events=("r_events", ["EndAnimation", "Animation"]),
-                EndAnimation=self._linked, Animation=self._linked,
-            )  # fmt: skip
+            return controls.picture(self.pictures[number].plotter, f"results_{number}", self._linked)
 
     def _linked(self, *_: Any, **__: Any) -> None:
         """Show the same camera in both pictures."""
@@ -420,7 +327,7 @@ class Results:
         controls.choice("r_chart_kind", "histogram, or profile along an axis", (kinds,))
         html.Div(v_html=("r_chart",))
 
-    def _out_controls(self) -> None:
+    def _view_controls(self) -> None:
         html.H3("View")
         with html.Div(classes="lf-buttons"):
             for name in VIEWS:
@@ -428,18 +335,3 @@ class Results:
             for name, icon in zip(("left", "right", "up", "down", "closer", "farther"), "⟲⟳↑↓+−", strict=True):
                 controls.button(icon, (self.look_along, f"['{name}']"), title=f"turn {name}", id=f"r-turn-{name}")
         controls.choice("r_other", "side by side with", ("r_others",), id="r-other")
-        html.H3("Take along")
-        with html.Div(classes="lf-buttons"):
-            controls.button("PNG", "utils.download('lfpiv.png', trigger('r_png'), 'image/png')")
-            controls.button("Film of a turn", "utils.download('turn.mp4', trigger('r_film', ['turn']), 'video/mp4')")
-            film = "utils.download('series.mp4', trigger('r_film', ['series']), 'video/mp4')"
-            controls.button("Film of the series", film, v_if="r_numbers > 1")
-            controls.button("VTI", "utils.download('field.vti', trigger('r_vti'), 'application/xml')")
-            controls.button("CSV", "utils.download('field.csv', trigger('r_csv'), 'text/csv')")
-            controls.button("Copy as Python", self.copy, "mdi-language-python", id="r-copy")
-
-
-def title_of(name: str) -> str:
-    """Return what people call a field, with its unit."""
-    text, unit = LABELS.get(name, (name.replace("_", " "), ""))
-    return f"{text} [{unit}]" if unit else text

@@ -74,7 +74,8 @@ def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
     make_writable(out)
     for name in (LOG, PROGRESS):
         (out / name).unlink(missing_ok=True)
-    command = [sys.executable, "-m", "lfpiv", "run", str(experiment), "--out", str(out), *options]
+    folder = os.path.relpath(out, experiment.parent)
+    command = [sys.executable, "-m", "lfpiv", "run", experiment.name, "--out", folder, *options]
     with (out / LOG).open("wb") as log:
         log.write(("$ lfpiv " + " ".join(command[3:]) + "\n").encode(errors="replace"))
         log.flush()
@@ -92,8 +93,9 @@ _children: list[subprocess.Popen[bytes]] = []
 
 def status(process: int) -> str:
     """Return "running", "paused" or "ended"."""
-    for child in _children:
-        child.poll()
+    own = next((child for child in _children if child.pid == process), None)
+    if own is not None and own.poll() is not None:
+        return "ended"
     try:
         state = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
     except OSError:
@@ -102,7 +104,8 @@ def status(process: int) -> str:
         except OSError:
             return "ended"
         return "running"
-    return {"T": "paused", "t": "paused", "Z": "ended", "X": "ended"}.get(state, "running")
+    gone = "running" if own is not None else "ended"  # the last threads of a process end after its first
+    return {"T": "paused", "t": "paused", "Z": gone, "X": gone}.get(state, "running")
 
 
 def exit_status(process: int) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 
 import trame_client.widgets.html as html
@@ -22,6 +23,7 @@ class Runs:
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
         self.process: int | None = None
+        self.stopped = False
         self.state.update(
             {
                 "p_out": "results", "p_pairs": "", "p_volumes": False, "p_workers": "", "p_status": "none",
@@ -44,8 +46,7 @@ class Runs:
         """Offer the folder of the open results."""
         results, experiment = self.session.results, self.session.experiment
         if what == "results" and results is not None and results.is_dir():
-            inside = experiment is not None and experiment.parent in results.parents
-            self.state.p_out = str(results.relative_to(experiment.parent)) if inside else str(results)  # type: ignore[union-attr]
+            self.state.p_out = os.path.relpath(results, experiment.parent) if experiment else str(results)
 
     def start(self) -> None:
         """Start the run that is asked for; a finished part in the folder is not repeated."""
@@ -68,6 +69,7 @@ class Runs:
     def control(self, what: str) -> None:
         """Pause, resume or stop the run."""
         if self.process is not None:
+            self.stopped = what == "stop"
             getattr(run_process, what)(self.process)
         self._look()
 
@@ -101,9 +103,9 @@ class Runs:
         """Show warnings of the finished run, and its results in the other tabs."""
         number = run_process.exit_status(self.process or 0)
         self.process = None
-        self.state.p_end = {0: "finished", 3: "finished; some pairs failed", None: "ended"}.get(
-            number, "ended early; see its log"
-        )
+        ends = {0: "finished", 3: "finished; some pairs failed", None: "ended"}
+        early = "stopped; Start goes on from there" if self.stopped else "ended early; see its log"
+        self.state.p_end, self.stopped = ends.get(number, early), False
         if number in (0, 3, None) and (finished := run_process.finished_warnings(out)):
             self.state.p_warnings = finished
         if any((out / "vectors").glob("*.nc")):

@@ -106,8 +106,14 @@ async def _run(session: Any, port: int) -> None:
         sys.stdout.flush()
         os._exit(0)
 
+    def failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if not isinstance(context.get("exception"), ConnectionError):  # which a page that is closed leaves behind
+            loop.default_exception_handler(context)
+
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(failed)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, end)
+        loop.add_signal_handler(number, end)
     await session.server.start(  # thread: no handlers of signals besides those above
         port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
         disable_logging=True, timeout=0, thread=True,

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pyvista as pv
 import trame_client.widgets.html as html
-from trame.widgets import vtk as vtk_widgets
 
 from lfpiv.experiment.images import read_header
 from lfpiv.studio import controls, rig_space
@@ -100,7 +99,7 @@ class Space:
         if s.s_seen:
             p.add_mesh(
                 counted, scalars="cameras", cmap="viridis", clim=[0, len(views)], opacity=0.35, render=False,
-                scalar_bar_args={"title": "cameras", "color": ink, "n_labels": len(views) + 1, "fmt": "%.0f"},
+                scalar_bar_args={"title": "cameras\n", "color": ink, "n_labels": len(views) + 1, "fmt": "%.0f"},
             )  # fmt: skip
         p.add_axes(color=ink)
         self._handles(solids, box, centre, size)
@@ -238,6 +237,4 @@ class Space:
                         text = f"along {name}" if len(name) == 1 else name
                         controls.button(text, (guarded(self.look_along), f"['{name}']"), id=f"s-look-{name}")
             with html.Div(classes="lf-main"), html.Div(classes="lf-view", id="s-view"):
-                self.view = vtk_widgets.VtkRemoteView(
-                    self.plotter.render_window, ref="space", interactive_ratio=0.7, interactive_quality=70
-                )
+                self.view = controls.picture(self.plotter, "space")

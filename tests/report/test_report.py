@@ -121,8 +121,8 @@ def test_the_page_is_well_formed_and_whole(text):
     for _, attributes in page.elements:
         for key in ("src", "href"):
             assert re.match("data:|#", attributes.get(key, "#")), "the page refers to something outside itself"
-    # board; cameras; volumes; best slice, profile, depths, space, streams, vorticity, uncertainty, histograms; pairs
-    assert len(page.all("svg")) == 1 + 2 * 9 + 3 + 2 + 1 + 1 + 5 + 1 + 3 + 3 + 3 + 3 + 3
+    # raw, board, cameras, volumes, slice, profile, depths, space, streams, vorticity, uncertainty, histograms, pairs
+    assert len(page.all("svg")) == 2 + 1 + 2 * 9 + 3 + 2 + 1 + 1 + 5 + 1 + 3 + 3 + 3 + 3 + 3
     assert "figure" not in page.open and len(page.all("figure")) == len(page.all("figcaption"))
 
 
