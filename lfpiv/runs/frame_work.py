@@ -19,9 +19,9 @@ from lfpiv.geometry.grid import Layers
 from lfpiv.progress import StepProgress
 from lfpiv.results.pair_files import VolumeFile
 from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
-from lfpiv.runs.pair_volumes import Followed, Reconstructor
+from lfpiv.runs.pair_volumes import Reconstructor, SequenceFrame
 from lfpiv.runs.side_threads import ReadAhead, Writer
-from lfpiv.sequence.solver import Before
+from lfpiv.sequence.solver import PreviousFrame
 from lfpiv.warn import FirstOfEachCode, Warning
 
 if TYPE_CHECKING:
@@ -111,7 +111,9 @@ class FrameWork:
                 del self.recent[old]
         return light
 
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
+    def follow(
+        self, light: FrameLight, previous: PreviousFrame | None, progress: StepProgress
+    ) -> tuple[SequenceFrame, PreviousFrame]:
         """Reconstruct a frame of a series from its predecessor; return it and what its successor needs.
 
         Raises
@@ -122,7 +124,7 @@ class FrameWork:
         frame = light.frame.number
         self.log_warnings(frame, light.warnings)
         self.writer.wait_large()
-        found, coming = self.reconstructor.follow(light, before, progress)
+        found, coming = self.reconstructor.follow(light, previous, progress)
         self.log_warnings(frame, found.light.warnings[len(light.warnings) :])
         return found, coming
 

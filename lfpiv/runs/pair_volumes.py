@@ -27,7 +27,7 @@ from lfpiv.progress import StepProgress
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes
 from lfpiv.runs.frame_light import FrameLight
-from lfpiv.sequence.solver import Before, SequenceSolver, Solved, Start
+from lfpiv.sequence.solver import PreviousFrame, SequenceResult, SequenceSolver, StartedFrom
 from lfpiv.settings.processing import Correlation
 from lfpiv.warn import Code, Warning
 
@@ -38,18 +38,18 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Followed:
+class SequenceFrame:
     """A frame that was reconstructed from its images and from the frames before it."""
 
     light: FrameLight
     """Its images, with a warning more if the particles were not where they were predicted."""
-    solved: Solved
+    result: SequenceResult
     seconds: float
     """Time of the reconstruction [s]."""
 
-    def finished(self) -> Followed:
+    def finished(self) -> SequenceFrame:
         """Return it without its images: its volume still corrects others."""
-        return replace(self, light=replace(self.light, images={}), solved=replace(self.solved, prepared=None))
+        return replace(self, light=replace(self.light, images={}), result=replace(self.result, prepared=None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,9 @@ class Reconstructor:
         volume = found.to_dataarray().assign_attrs(estimate=Estimate.ALONE.value)
         return self._frame(volume, light, seconds)
 
-    def follow(self, light: FrameLight, before: Before | None, progress: StepProgress) -> tuple[Followed, Before]:
+    def follow(
+        self, light: FrameLight, previous: PreviousFrame | None, progress: StepProgress
+    ) -> tuple[SequenceFrame, PreviousFrame]:
         """Reconstruct a frame of a series from its predecessor, and return it with what its successor needs.
 
         Raises
@@ -146,23 +148,23 @@ class Reconstructor:
         number, start = light.frame.number, time.perf_counter()
         try:
             mask = self.solid(light.frame)
-            solved = self.sequence.solve(light.images, before, floor=light.noise, mask=mask, progress=progress)
+            result = self.sequence.solve(light.images, previous, floor=light.noise, mask=mask, progress=progress)
         except ValueError as error:
             raise InputError(f"{light.frame.label}: {error}") from error
-        if solved.start is Start.MISSED:
-            missed = Warning(code=Code.NOT_FOLLOWED, figures={"ratio": solved.misfit_ratio}, instants=(number,))
+        if result.started_from is StartedFrom.MISSED:
+            missed = Warning(code=Code.NOT_FOLLOWED, figures={"ratio": result.misfit_ratio}, instants=(number,))
             light = replace(light, warnings=(*light.warnings, missed))
-        measured = _as_written(solved.found.to_dataarray(), self.experiment.grid)
+        measured = _as_written(result.found.to_dataarray(), self.experiment.grid)
         seconds = time.perf_counter() - start
-        log.info("%s: %s, in %.1f s", light.frame.label, solved.start.value, seconds)
-        return Followed(light=light, solved=solved, seconds=seconds), solved.before(measured, before)
+        log.info("%s: %s, in %.1f s", light.frame.label, result.started_from.value, seconds)
+        return SequenceFrame(light=light, result=result, seconds=seconds), result.as_previous(measured, previous)
 
-    def correct(self, trail: Sequence[Followed], at: int, progress: StepProgress) -> FrameVolume:
+    def correct(self, trail: Sequence[SequenceFrame], at: int, progress: StepProgress) -> FrameVolume:
         """Reconstruct one of successive frames again from those before and after it; raise as `pair`."""
         own, start = trail[at], time.perf_counter()
         label = own.light.frame.label
         try:
-            found = self.sequence.correct([one.solved for one in trail], at, progress)
+            found = self.sequence.correct([one.result for one in trail], at, progress)
         except ValueError as error:
             raise InputError(f"{label}: {error}") from error
         seconds = own.seconds + time.perf_counter() - start

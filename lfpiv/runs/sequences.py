@@ -24,8 +24,8 @@ from lfpiv.results.pair_files import PairFiles, VolumeFile
 from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.frame_work import FrameWork
 from lfpiv.runs.frames import Failure, Frames, HeldFrame, attempted
-from lfpiv.runs.pair_volumes import Followed
-from lfpiv.sequence.solver import Before, Start
+from lfpiv.runs.pair_volumes import SequenceFrame
+from lfpiv.sequence.solver import PreviousFrame, StartedFrom
 from lfpiv.warn import Code, Warning
 
 
@@ -80,11 +80,11 @@ class Segment:
     """The last instant that is finished."""
     last: int = -1
     """The last instant that was followed or failed; some are ahead of the finished ones, to correct these."""
-    before: Before | None = None
+    previous: PreviousFrame | None = None
     """What the next instant starts from; None if it starts from its images alone."""
     fingerprints: dict[str, bytes] = field(default_factory=dict)
     """Hash of the last instant's images by camera; empty if it failed."""
-    trail: dict[int, Followed | Failure] = field(default_factory=dict)
+    trail: dict[int, SequenceFrame | Failure] = field(default_factory=dict)
     """Instants that were followed or failed and that correct others, or will be corrected."""
     beginnings: set[int] = field(default_factory=set)
     """Instants whose particles are not those of the instant before, as far as one knows."""
@@ -102,7 +102,7 @@ class Segment:
             whole = followed(frames, frame.number)
             if self.done is None or self.done >= frame.number:
                 self.done = self.last = whole[0] - 1
-                self.before, self.fingerprints, self.trail, self.beginnings = None, {}, {}, set()
+                self.previous, self.fingerprints, self.trail, self.beginnings = None, {}, {}, set()
             coming = range(self.done + 1, frame.number + 1)
             for place, number in enumerate(coming):
                 step = part_of(progress, place / len(coming), (place + 1) / len(coming))
@@ -116,7 +116,7 @@ class Segment:
         """Finish the next instant, after it and those later ones that correct it were followed."""
         coming = range(self.last + 1, later.stop)
         for place, one in enumerate(coming):
-            if segment_of(one) != self.number and self.before is not None and self.before.given_up:
+            if segment_of(one) != self.number and self.previous is not None and self.previous.given_up:
                 self.last = one  # no instant of the segment is corrected by it
                 continue
             step = part_of(progress, place / (len(coming) + 1), (place + 1) / (len(coming) + 1))
@@ -126,26 +126,26 @@ class Segment:
             step = part_of(progress, len(coming) / (len(coming) + 1), 1.0)
             self.ahead[number] = self._corrected(number, step)
         own = self.trail.get(number)
-        if isinstance(own, Followed):
+        if isinstance(own, SequenceFrame):
             self.trail[number] = own.finished()
         self.trail = {one: found for one, found in self.trail.items() if one > number - segments.REACH}
 
-    def _follow(self, number: int, progress: StepProgress) -> Followed | Failure:
+    def _follow(self, number: int, progress: StepProgress) -> SequenceFrame | Failure:
         """Reconstruct the next instant from the one before. After one that fails, the sequence begins anew."""
         self.last = number
 
-        def follow() -> Followed:
+        def follow() -> SequenceFrame:
             light = self._checked(self.work.light_again(self.work.experiment.recording.frame(number)))
-            if self.before is None:
+            if self.previous is None:
                 self.beginnings.add(number)
-            found, self.before = self.work.follow(light, self.before, progress)
+            found, self.previous = self.work.follow(light, self.previous, progress)
             return found
 
         found = attempted(follow)
         if isinstance(found, Failure):
-            self.before, self.fingerprints = None, {}
+            self.previous, self.fingerprints = None, {}
             return found
-        if found.solved.start in (Start.MISSED, Start.UNRESOLVED):
+        if found.result.started_from in (StartedFrom.MISSED, StartedFrom.UNRESOLVED):
             self.beginnings.add(number)
         self.fingerprints = dict(found.light.fingerprints)
         return found
@@ -158,11 +158,11 @@ class Segment:
         found = attempted(partial(self.work.reconstructor.correct, *self._beside(number), progress))
         return found if isinstance(found, Failure) else HeldFrame(own.light.frame, own.light, found)
 
-    def _beside(self, number: int) -> tuple[list[Followed], int]:
+    def _beside(self, number: int) -> tuple[list[SequenceFrame], int]:
         """Return an instant with those that correct it, and its index among them."""
 
         def known(one: int) -> bool:
-            return isinstance(self.trail.get(one), Followed)
+            return isinstance(self.trail.get(one), SequenceFrame)
 
         first = last = number
         while first > number - segments.REACH and first not in self.beginnings and known(first - 1):
@@ -170,14 +170,14 @@ class Segment:
         while last < number + segments.REACH and last + 1 not in self.beginnings and known(last + 1):
             last += 1
         found = (self.trail[one] for one in range(first, last + 1))
-        return [one for one in found if isinstance(one, Followed)], number - first
+        return [one for one in found if isinstance(one, SequenceFrame)], number - first
 
     def _checked(self, light: FrameLight) -> FrameLight:
         """Return the light of the next instant, with a warning if an image is that of the instant before."""
         same = [name for name, mark in light.fingerprints.items() if self.fingerprints.get(name) == mark]
         if not same:
             return light
-        self.before = None  # particles that seem to rest say nothing of the flow
+        self.previous = None  # particles that seem to rest say nothing of the flow
         number = light.frame.number
         figures = {"camera": " and ".join(same), "before": number - 1}
         repeated = Warning(code=Code.REPEATED, figures=figures, instants=(number,))

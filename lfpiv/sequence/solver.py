@@ -68,7 +68,7 @@ MeasureFlow = Callable[[xr.DataArray, xr.DataArray, Mapping[str, Any], xr.Datase
 """Takes two successive volumes, settings of `correlate` and the flow known before; returns the flow between them."""
 
 
-class Start(enum.Enum):
+class StartedFrom(enum.Enum):
     """From what a frame started; the text says why."""
 
     FIRST = "the flow is not known yet"
@@ -78,7 +78,7 @@ class Start(enum.Enum):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Before:
+class PreviousFrame:
     """What is known at a frame, for the next one."""
 
     volume: np.ndarray
@@ -99,13 +99,13 @@ class Before:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Solved:
+class SequenceResult:
     """One frame of a sequence, from its images and the frames before it."""
 
     prepared: PreparedFrame | None
     """The images; None once they are not needed any more."""
     found: Reconstruction
-    start: Start
+    started_from: StartedFrom
     flow: xr.Dataset | None = None
     """Displacement from one frame to the next, as it was known before this frame."""
     vectors: xr.Dataset | None = None
@@ -113,17 +113,17 @@ class Solved:
     misfit_ratio: float = math.nan
     """Misfit of a prediction that missed over that of particles in other places; NaN for other starts."""
 
-    def before(self, measured: xr.DataArray, last: Before | None) -> Before:
+    def as_previous(self, measured: xr.DataArray, last: PreviousFrame | None) -> PreviousFrame:
         """Return what the next frame starts from. `measured` is this volume on the grid of the experiment.
 
         Particles are not followed from the frame before if the prediction missed. The flow stays known: one dark
         image does not change it.
         """
-        earlier = None if last is None or self.start is Start.MISSED else last.measured
+        earlier = None if last is None or self.started_from is StartedFrom.MISSED else last.measured
         known = 0 if last is None else last.unresolved
-        unresolved = known + 1 if self.start is Start.UNRESOLVED else 0
+        unresolved = known + 1 if self.started_from is StartedFrom.UNRESOLVED else 0
         volume = self.found.volume
-        return Before(volume=volume, measured=measured, earlier=earlier, flow=self.flow, unresolved=unresolved)
+        return PreviousFrame(volume=volume, measured=measured, earlier=earlier, flow=self.flow, unresolved=unresolved)
 
 
 class SequenceSolver:
@@ -153,28 +153,30 @@ class SequenceSolver:
     def solve(
         self,
         images: Mapping[str, np.ndarray],
-        before: Before | None,
+        previous: PreviousFrame | None,
         *,
         floor: float | Mapping[str, float] | None = None,
         mask: np.ndarray | None = None,
         progress: Callable[[float], None] | None = None,
-    ) -> Solved:
+    ) -> SequenceResult:
         """Reconstruct a frame from its images and the one before; arguments as of `SmartSolver.solve`.
 
-        `before` is what is known at the frame before; None reconstructs the frame from its images alone.
+        `previous` is what is known at the frame before; None reconstructs the frame from its images alone.
 
         Raises
         ------
         ValueError
             If `SmartSolver.solve` or `correlate` refuse their arguments.
         """
-        given_up = before is not None and before.given_up
-        known = None if given_up else before
+        given_up = previous is not None and previous.given_up
+        known = None if given_up else previous
         prepared, (flow, vectors) = runtime.side_by_side(
             lambda: self.smart.prepare(images, floor=floor, mask=mask), lambda: self._flow(known)
         )
 
-        def solved(start: Start, share: float, first: np.ndarray | None = None, ratio: float = math.nan) -> Solved:
+        def solved(
+            started_from: StartedFrom, share: float, first: np.ndarray | None = None, ratio: float = math.nan
+        ) -> SequenceResult:
             if share == 1:
                 found = prepared.solve(progress=progress)
             else:
@@ -183,32 +185,39 @@ class SequenceSolver:
                     found = prepared.solve(iterations=count, whole_passes=0, brief=True, progress=progress)
                 else:
                     found = self._continued(prepared, first, count, progress)
-            return Solved(prepared=prepared, found=found, start=start, flow=flow, vectors=vectors, misfit_ratio=ratio)
+            return SequenceResult(
+                prepared=prepared,
+                found=found,
+                started_from=started_from,
+                flow=flow,
+                vectors=vectors,
+                misfit_ratio=ratio,
+            )
 
         if given_up:
-            return solved(Start.UNRESOLVED, 1)
-        if before is None or flow is None:
-            return solved(Start.FIRST, FIRST_SHARE)
+            return solved(StartedFrom.UNRESOLVED, 1)
+        if previous is None or flow is None:
+            return solved(StartedFrom.FIRST, FIRST_SHARE)
         if roughness(flow) > ROUGHEST:
-            return solved(Start.UNRESOLVED, 1)
+            return solved(StartedFrom.UNRESOLVED, 1)
         plain = prepared.guess()
-        guess = _concentrated(predicted_guess(before.volume, plain, flow), plain)
+        guess = _concentrated(predicted_guess(previous.volume, plain, flow), plain)
         misfit = prepared.sampled_misfit(guess)
         if not misfit < prepared.sampled_misfit():
-            exchanged = predicted_guess(_exchanged(before.volume), plain, flow)
+            exchanged = predicted_guess(_exchanged(previous.volume), plain, flow)
             chance = prepared.sampled_misfit(_concentrated(exchanged, plain))
             if not misfit < LEAST_AGREEMENT * chance:
-                return solved(Start.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
-        return solved(Start.PREDICTED, ITERATION_SHARE, guess)
+                return solved(StartedFrom.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
+        return solved(StartedFrom.PREDICTED, ITERATION_SHARE, guess)
 
     def correct(
-        self, trail: Sequence[Solved], at: int, progress: Callable[[float], None] | None = None
+        self, trail: Sequence[SequenceResult], at: int, progress: Callable[[float], None] | None = None
     ) -> Reconstruction:
         """Reconstruct one frame again from those before and after it.
 
         Parameters
         ----------
-        trail : sequence of Solved
+        trail : sequence of SequenceResult
             Successive frames that show the same particles, at most `lfpiv.experiment.segments.REACH` on each side.
         at : int
             Index of the frame in `trail`.
@@ -222,7 +231,7 @@ class SequenceSolver:
         """
         own = trail[at]
         assert own.prepared is not None
-        alone = own.found if own.start is Start.UNRESOLVED else None
+        alone = own.found if own.started_from is StartedFrom.UNRESOLVED else None
         flows = [one.vectors for one in trail[2:] if one.vectors is not None]
         if not flows and trail[-1].flow is not None:
             flows = [trail[-1].flow]
@@ -248,20 +257,20 @@ class SequenceSolver:
         count, time = max(round(count * min(1, SHARE_SUBSETS / len(self.smart.subsets))), 1), normal.following_time
         return prepared.refine(guess, normal.followed, epochs=count, time=time, brief=True, progress=progress)
 
-    def _flow(self, before: Before | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
+    def _flow(self, previous: PreviousFrame | None) -> tuple[xr.Dataset | None, xr.Dataset | None]:
         """Return the displacement by which the next frame is predicted, and the last one measured, if known."""
-        if before is None:
+        if previous is None:
             return None, None
-        if before.earlier is None:
-            return before.flow, None
-        found = self._measure(before.earlier, before.measured, self.correlation, before.flow)
+        if previous.earlier is None:
+            return previous.flow, None
+        found = self._measure(previous.earlier, previous.measured, self.correlation, previous.flow)
         if found.attrs["valid_fraction"] < LEAST_VALID * found.attrs["measurable_fraction"]:
-            return before.flow, None
-        if before.flow is None:
+            return previous.flow, None
+        if previous.flow is None:
             return found, found
         mean = {}
         for name in (f"displacement_{axis}" for axis in "zyx"):
-            values = FLOW_MEMORY * before.flow[name].values + (1 - FLOW_MEMORY) * found[name].values
+            values = FLOW_MEMORY * previous.flow[name].values + (1 - FLOW_MEMORY) * found[name].values
             mean[name] = (AXES, values, found[name].attrs)
         return found.assign(mean), found
 
@@ -303,7 +312,7 @@ def _concentrated(guess: np.ndarray, like: Reconstruction) -> np.ndarray:
     return guess if like.sieve_voxel > 0 else without_dark(guess)
 
 
-def _within_reach(trail: Sequence[Solved], at: int, rough: float) -> dict[int, Reconstruction]:
+def _within_reach(trail: Sequence[SequenceResult], at: int, rough: float) -> dict[int, Reconstruction]:
     """Return other frames from which particles are moved to one, by the number of steps to it."""
     steps = {number: at - number for number in range(len(trail)) if number != at}
     return {step: trail[number].found for number, step in steps.items() if abs(step) * rough <= ROUGHEST}

@@ -99,7 +99,7 @@ Look = Callable[[int, np.ndarray, np.ndarray], FoundParticles]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed:
+class TrackedParticles:
     """Particles of a time series by track; every array has a row for each found particle, by track and then in time."""
 
     track: np.ndarray
@@ -124,14 +124,14 @@ class Followed:
             number, self.instant[rows].astype(float), self.positions_voxel[rows], self.errors_voxel[rows]
         )
 
-    def refitted(self) -> Followed:
+    def refitted(self) -> TrackedParticles:
         """Return the same with the motion that the longest tracks show."""
         length = np.bincount(self.track)
         longest = np.argsort(-length, kind="stable")[:TELLING_TRACKS]
         return replace(self, motion=fit_motion(self.measured(np.sort(longest)), self.motion))
 
 
-def follow(instants: Iterable[tuple[int, Candidates]], look: Look) -> Followed:
+def follow(instants: Iterable[tuple[int, Candidates]], look: Look) -> TrackedParticles:
     """Follow the particles of a time series.
 
     Parameters
@@ -143,7 +143,7 @@ def follow(instants: Iterable[tuple[int, Candidates]], look: Look) -> Followed:
 
     Returns
     -------
-    Followed
+    TrackedParticles
         All particles that were found. They do not depend on the order of the candidates.
     """
     tracks = _Tracks()
@@ -216,11 +216,11 @@ class _Tracks:
         self.light = np.concatenate([self.light, found.light[new]])
         self.begun += len(new)
 
-    def followed(self) -> Followed:
+    def followed(self) -> TrackedParticles:
         """Return the particles of all tracks."""
         empty = (np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
         track, instant, *others = (np.concatenate(one) for one in zip(empty, *self.rows, strict=True))
         order = np.lexsort((instant, track))
         names = ("positions_voxel", "errors_voxel", "light", "signal_to_noise")
         arrays = {name: one[order] for name, one in zip(names, others, strict=True)}
-        return Followed(track=track[order], instant=instant[order], motion=self.motion, **arrays)
+        return TrackedParticles(track=track[order], instant=instant[order], motion=self.motion, **arrays)

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.names import COMPONENTS, PARTICLE
-from lfpiv.tracking.following import Followed
+from lfpiv.tracking.following import TrackedParticles
 from lfpiv.tracking.linking import agreeing
 from lfpiv.tracking.trajectory import State, smooth
 
@@ -26,12 +26,12 @@ MOST_UNLIKE = 0.5
 """Largest share of the instants of a track in which it moves unlike its neighbours."""
 
 
-def track_table(followed: Followed, *, voxel_mm: float, dt_s: float) -> xr.Dataset:
+def track_table(followed: TrackedParticles, *, voxel_mm: float, dt_s: float) -> xr.Dataset:
     """Return the table of tracks.
 
     Parameters
     ----------
-    followed : Followed
+    followed : TrackedParticles
         Particles by track.
     voxel_mm : float
         Edge of a voxel [mm].
@@ -98,7 +98,7 @@ def _about(units: str, words: str) -> dict[str, Any]:
     return {"units": units, "long_name": words}
 
 
-def _fitted(followed: Followed) -> State:
+def _fitted(followed: TrackedParticles) -> State:
     """Return the state of each row, shapes (row, axis, 3) and (row, axis, 3, 3)."""
     count = len(followed.track)
     mean, variance = np.zeros((count, 3, 3)), np.zeros((count, 3, 3, 3))
@@ -112,7 +112,7 @@ def _fitted(followed: Followed) -> State:
     return State(mean, variance)
 
 
-def _unlike(followed: Followed, state: State, long: np.ndarray) -> np.ndarray:
+def _unlike(followed: TrackedParticles, state: State, long: np.ndarray) -> np.ndarray:
     """Return the rows of long tracks that move unlike their neighbours in most of their instants, bool."""
     unlike = np.zeros(len(long), bool)
     rows_of_long = np.flatnonzero(long)

@@ -15,7 +15,7 @@ from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.sequence import solver as sequence
-from lfpiv.sequence.solver import Before, SequenceSolver, Start
+from lfpiv.sequence.solver import PreviousFrame, SequenceSolver, StartedFrom
 from lfpiv.simulation.flows import Swirl, Uniform
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.4, 2.0), voxel_mm=0.1)
@@ -85,18 +85,18 @@ def solver(weights):
 
 def along(solver, images):
     """Solve instants one after the other; return all of them, and what follows from the last one."""
-    before, done = None, []
+    previous, done = None, []
     for one in images:
-        done.append(solver.solve(one, before))
-        before = done[-1].before(done[-1].found.to_dataarray(), before)
-    return done, before
+        done.append(solver.solve(one, previous))
+        previous = done[-1].as_previous(done[-1].found.to_dataarray(), previous)
+    return done, previous
 
 
 def test_volumes_gain_by_fewer_iterations_if_the_flow_is_known(solver, series):
     positions, images, _ = series
     exact = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings, known: vectors_of(FLOW))
     done, _ = along(exact, images)
-    assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.PREDICTED] * (INSTANTS - 2)
+    assert [one.started_from for one in done] == [StartedFrom.FIRST] * 2 + [StartedFrom.PREDICTED] * (INSTANTS - 2)
     most = np.ceil(sequence.ITERATION_SHARE * ITERATIONS)
     assert all(one.found.iterations <= most for one in done[2:])
     for number in (INSTANTS - 4, INSTANTS - 1):  # with three instants after it, and with none
@@ -128,7 +128,7 @@ def test_a_flow_that_is_not_resolved_moves_nothing(solver, series):
     rough = rough_vectors()
     unresolved = SequenceSolver(solver.smart, CORRELATION, lambda first, second, settings, known: rough)
     done, _ = along(unresolved, images[:3])
-    assert done[2].start is Start.UNRESOLVED
+    assert done[2].started_from is StartedFrom.UNRESOLVED
     expected = solver.smart.solve(images[2]).volume
     assert np.array_equal(done[2].found.volume, expected)
     assert np.array_equal(unresolved.correct(done, 2).volume, expected)
@@ -140,42 +140,44 @@ def test_after_some_flows_that_are_not_resolved_none_is_measured(solver, series)
     rough = rough_vectors()
     measured = []
     unresolved = SequenceSolver(solver.smart, CORRELATION, lambda *arguments: measured.append(arguments) or rough)
-    done, before = along(unresolved, images[:6])
-    assert [one.start for one in done] == [Start.FIRST] * 2 + [Start.UNRESOLVED] * 4
-    assert len(measured) == sequence.TRIES and before.given_up
+    done, previous = along(unresolved, images[:6])
+    assert [one.started_from for one in done] == [StartedFrom.FIRST] * 2 + [StartedFrom.UNRESOLVED] * 4
+    assert len(measured) == sequence.TRIES and previous.given_up
     assert np.array_equal(done[5].found.volume, solver.smart.solve(images[5]).volume)
     assert not along(solver, images[:3])[1].given_up
 
 
 def test_tries_are_counted_one_after_the_other(solver, series):
     _, images, _ = series
-    done, before = along(solver, images[:3])
-    assert done[2].start is Start.PREDICTED
-    nearly = dataclasses.replace(before, unresolved=sequence.TRIES - 1)
-    assert done[2].before(before.measured, nearly).unresolved == 0
+    done, previous = along(solver, images[:3])
+    assert done[2].started_from is StartedFrom.PREDICTED
+    nearly = dataclasses.replace(previous, unresolved=sequence.TRIES - 1)
+    assert done[2].as_previous(previous.measured, nearly).unresolved == 0
 
 
 def test_a_change_of_the_scene_is_noticed_and_the_instant_starts_from_its_images(solver, series):
     _, images, others = series
-    done, before = along(solver, images[:3])
-    changed = solver.solve(others, before)
-    assert changed.start is Start.MISSED and changed.misfit_ratio > sequence.LEAST_AGREEMENT
+    done, previous = along(solver, images[:3])
+    changed = solver.solve(others, previous)
+    assert changed.started_from is StartedFrom.MISSED and changed.misfit_ratio > sequence.LEAST_AGREEMENT
     alone = solver.smart.solve(others)
     assert np.array_equal(solver.correct([changed], 0).volume, alone.volume)
-    after = changed.before(changed.found.to_dataarray(), before)
+    after = changed.as_previous(changed.found.to_dataarray(), previous)
     assert after.earlier is None, "the flow is not measured between different particles"
     assert after.flow is not None, "the flow stays known"
-    expected = solver.solve(images[3], before)
-    assert expected.start is Start.PREDICTED and np.isnan(expected.misfit_ratio) and done[2].flow is not None
+    expected = solver.solve(images[3], previous)
+    assert (
+        expected.started_from is StartedFrom.PREDICTED and np.isnan(expected.misfit_ratio) and done[2].flow is not None
+    )
 
 
 def test_nothing_is_predicted_before_the_flow_is_known(solver, series):
     _, images, others = series
     first = solver.solve(images[0], None)
-    second = solver.solve(images[1], first.before(first.found.to_dataarray(), None))
-    assert first.start is second.start is Start.FIRST
-    strange = solver.solve(others, second.before(second.found.to_dataarray(), None))
-    assert strange.start is Start.FIRST, "no earlier volume"
+    second = solver.solve(images[1], first.as_previous(first.found.to_dataarray(), None))
+    assert first.started_from is second.started_from is StartedFrom.FIRST
+    strange = solver.solve(others, second.as_previous(second.found.to_dataarray(), None))
+    assert strange.started_from is StartedFrom.FIRST, "no earlier volume"
 
 
 def plain_guess(solver, images):
@@ -234,8 +236,8 @@ def test_the_flow_is_a_mean_over_time(solver, series):
 
     averaging = SequenceSolver(solver.smart, CORRELATION, measure)
     images = series[1][2]
-    before = Before(volume=volumes[1].values, measured=volumes[1], earlier=volumes[0], flow=known)
-    solved = averaging.solve(images, before)
+    previous = PreviousFrame(volume=volumes[1].values, measured=volumes[1], earlier=volumes[0], flow=known)
+    solved = averaging.solve(images, previous)
     shift = solved.flow["displacement_x"] - found["displacement_x"]
     assert np.allclose(shift, sequence.FLOW_MEMORY, atol=1e-5)
     assert given[0][0] is volumes[0] and given[0][1] is volumes[1]
