@@ -59,7 +59,7 @@ class Missing:
         recording, pairs = self.experiment.recording, self.experiment.numbers
         if not self.end:
             return range(0)
-        return range(max(self.end.start - (recording.chain or 0), pairs.start), pairs.stop)
+        return range(max(self.end.start - (recording.shared_step or 0), pairs.start), pairs.stop)
 
     def message(self) -> str:
         """Return key, pattern, stated and found numbers, which are missing, and what to do."""
@@ -79,7 +79,7 @@ class Missing:
             if self.experiment.recording.is_series:
                 return f"The images count from {stated.start + 1}: state particles.first = {stated.start + 1}."
             return f"The images count from 1 to {stated.stop}, pairs count from 0: rename the images."
-        if self.end and (enough := self.end.start - stated.start) > (self.experiment.recording.chain or 0):
+        if self.end and (enough := self.end.start - stated.start) > (self.experiment.recording.shared_step or 0):
             return f"State particles.{noun}s = {enough}, or add the images."
         return "Add the images."
 

@@ -74,7 +74,7 @@ class Recording:
         return self.lasers == 1
 
     @property
-    def chain(self) -> int | None:
+    def shared_step(self) -> int | None:
         """Distance of pairs that share a frame; None where no pairs do."""
         return self.step if self.is_series else None
 

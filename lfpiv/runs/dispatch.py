@@ -1,8 +1,8 @@
 """Distribute pairs: one after the other in this process, or in parallel to worker processes that Dask watches.
 
-A worker gets a stretch: one image pair, or pairs of a series that share their instants (`lfpiv.runs.stretches`). If a
-worker dies, its stretch is tried once more, in another worker and after all others. If that worker dies too, the pairs
-of the stretch have failed, but for those that were finished before.
+A worker gets a work unit: one image pair, or pairs of a series that share their instants (`lfpiv.runs.work_units`). If
+a worker dies, its work unit is tried once more, in another worker and after all others. If that worker dies too, the
+pairs of the work unit that were not finished before have failed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lfpiv.runs.local_workers import Capacity
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.pending_pairs import PendingPairs
-from lfpiv.runs.stretches import CLUSTER_WORKERS, Stretch, cut, cut_at_segments
+from lfpiv.runs.work_units import CLUSTER_WORKERS, WorkUnit, cut, cut_at_segments
 from lfpiv.runs.worker_plan import Plan
 from lfpiv.warn import name_pairs
 from lfpiv_kernels.runtime import cores
@@ -42,7 +42,7 @@ TICK_S = 0.5
 def sequential(work: PairWork, pending: Iterable[int], progress: StepProgress) -> Generator[Outcome, None, None]:
     """Do pairs one after the other in this process; yield the outcome of each.
 
-    Pairs are taken from `pending` when their turn comes; pairs of a series come along its chains. `length_hint`
+    Pairs are taken from `pending` when their turn comes; pairs of a series come step by step. `length_hint`
     says how many may come.
     """
     source = iter(pending)
@@ -57,11 +57,11 @@ def _kept(pending: Iterable[int]) -> int:
     return pending.finished[1] if isinstance(pending, PendingPairs) else 0
 
 
-def _stretches(experiment: Experiment, pending: Iterable[int], workers: int) -> Iterable[Stretch]:
+def _units(experiment: Experiment, pending: Iterable[int], workers: int) -> Iterable[WorkUnit]:
     recording = experiment.recording
-    return (
-        cut_at_segments(pending, recording.step) if experiment.in_sequence else cut(pending, recording.chain, workers)
-    )
+    if experiment.in_sequence:
+        return cut_at_segments(pending, recording.step)
+    return cut(pending, recording.shared_step, workers)
 
 
 def parallel(
@@ -96,20 +96,20 @@ def parallel(
         cluster_workers.workers(workers, shared) if isinstance(workers, str) else local_workers.workers(workers, shared)
     )
     total = max(length_hint(pending), 1)
-    stretches = _stretches(experiment, pending, CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
+    units = _units(experiment, pending, CLUSTER_WORKERS if isinstance(workers, str) else workers.workers)
     with found as (client, capacity):
-        yield from Dispatch(client, capacity, shared, stretches, total, experiment.noun).outcomes(progress)
+        yield from Dispatch(client, capacity, shared, units, total, experiment.noun).outcomes(progress)
 
 
 class Dispatch:
-    """Stretches of pairs of a run on their way to and from the workers of a Dask client."""
+    """Work units of pairs of a run on their way to and from the workers of a Dask client."""
 
     def __init__(
         self,
         client: Any,
         capacity: Capacity,
         shared: Path,
-        pending: Iterable[Stretch],
+        pending: Iterable[WorkUnit],
         total: int,
         noun: str = "pair",
     ):
@@ -117,25 +117,25 @@ class Dispatch:
         self.total, self.done = total, 0
         """Largest number of pairs that may come, and the number of those that were done."""
         self.coming, self.all_came = iter(pending), False
-        """Stretches to submit after those that wait, and whether there are no more."""
-        self.waiting, self.again = deque[Stretch](), deque[Stretch]()
-        """Stretches to submit now, and after all others."""
-        self.running: dict[str, tuple[Any, Stretch]] = {}
-        """Key of Dask -> future and stretch; futures that are not referenced are cancelled."""
+        """Work units to submit after those that wait, and whether there are no more."""
+        self.waiting, self.again = deque[WorkUnit](), deque[WorkUnit]()
+        """Work units to submit now, and after all others."""
+        self.running: dict[str, tuple[Any, WorkUnit]] = {}
+        """Key of Dask -> future and work unit; futures that are not referenced are cancelled."""
         self.fractions: dict[str, float] = {}
         """Key of Dask -> number of finished pairs and parts of one, as its worker reports it."""
         self.tried: set[int] = set()
-        """First pairs of stretches whose worker died once."""
+        """First pairs of work units whose worker died once."""
         self.beside: Counter[int] = Counter()
-        """Pair at a seam -> number of finished stretches beside it."""
+        """Boundary pair -> number of finished work units beside it."""
         self.ready: set[int] = set()
-        """Pairs at seams that can be done; they go first, so that the volumes stored for them can be removed."""
+        """Boundary pairs that can be done; they go first, so that the volumes stored for them can be removed."""
         self.numbers = itertools.count()
         self.arrived: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.topic = f"lfpiv-{shared.name}"
 
     def outcomes(self, progress: StepProgress) -> Generator[Outcome, None, None]:
-        """Submit all stretches and yield the outcomes of their pairs."""
+        """Submit all work units and yield the outcomes of their pairs."""
         self.client.subscribe_topic(self.topic, lambda event: self.fractions.update([event[1]]))
         try:
             while True:
@@ -154,8 +154,8 @@ class Dispatch:
             with contextlib.suppress(Exception):  # the cluster may be lost
                 self.client.unsubscribe_topic(self.topic)
 
-    def _next(self) -> Stretch | None:
-        """Return the stretch to submit next; None if all are submitted."""
+    def _next(self) -> WorkUnit | None:
+        """Return the work unit to submit next; None if all are submitted."""
         if not self.waiting:
             if (coming := next(self.coming, None)) is not None:
                 return coming
@@ -165,59 +165,59 @@ class Dispatch:
         return self.waiting.popleft() if self.waiting else None
 
     def _submit(self) -> None:
-        """Submit as many waiting stretches as the workers take."""
+        """Submit as many waiting work units as the workers take."""
         room = self.capacity() - len(self.running)
-        while room > 0 and (stretch := self._next()) is not None:
+        while room > 0 and (unit := self._next()) is not None:
             room -= 1
-            first = stretch.pairs[0]
+            first = unit.pairs[0]
             name = f"{self.topic}-{first}-{next(self.numbers)}"
             options = {"priority": 1} if first in self.ready else {}
-            work = str(self.shared), stretch, self.topic, name
+            work = str(self.shared), unit, self.topic, name
             future = self.client.submit(_in_worker, *work, key=name, pure=False, **options)
-            self.running[name] = future, stretch
+            self.running[name] = future, unit
             future.add_done_callback(self.arrived.put)
 
     def _fraction(self) -> float:
-        running = ((self.fractions.get(key, 0.0), len(stretch.pairs)) for key, (_, stretch) in self.running.items())
+        running = ((self.fractions.get(key, 0.0), len(unit.pairs)) for key, (_, unit) in self.running.items())
         return (self.done + sum(min(counts) for counts in running)) / self.total
 
     def _outcomes(self, future: Any) -> Sequence[Outcome]:
-        """Return the outcomes of a stretch that came back; none if it is submitted once more."""
+        """Return the outcomes of a work unit that came back; none if it is submitted once more."""
         from distributed import KilledWorker
 
-        _, stretch = self.running.pop(future.key)
+        _, unit = self.running.pop(future.key)
         self.fractions.pop(future.key, None)
-        result = _fetched(future, self._name(stretch)) if future.status == "finished" else None
+        result = _fetched(future, self._name(unit)) if future.status == "finished" else None
         if result is not None:
             outcomes = _checked(result)
-            self._finish(stretch)
+            self._finish(unit)
             return outcomes
-        if future.status != "error":  # the scheduler forgot the stretch when the connection to it broke
-            self.waiting.append(stretch)
+        if future.status != "error":  # the scheduler forgot the work unit when the connection to it broke
+            self.waiting.append(unit)
             return ()
-        first = stretch.pairs[0]
+        first = unit.pairs[0]
         if not isinstance(future.exception(), KilledWorker):
-            raise RuntimeError(f"the workers cannot do {self._name(stretch)}: {_first_line(future.exception())}")
+            raise RuntimeError(f"the workers cannot do {self._name(unit)}: {_first_line(future.exception())}")
         if first not in self.tried:
             self.tried.add(first)
-            self.again.append(stretch)
-            log.info("%s: its worker died; it is tried once more in another one", self._name(stretch))
+            self.again.append(unit)
+            log.info("%s: its worker died; it is tried once more in another one", self._name(unit))
             return ()
-        self._finish(stretch)
+        self._finish(unit)
         reason = "its worker died, in each of two trials: killed, a crash, or too little memory"
-        return [Outcome(pair=pair, reason=reason, died=True) for pair in stretch.pairs]
+        return [Outcome(pair=pair, reason=reason, died=True) for pair in unit.pairs]
 
-    def _name(self, stretch: Stretch) -> str:
-        return name_pairs(stretch.pairs, self.noun)
+    def _name(self, unit: WorkUnit) -> str:
+        return name_pairs(unit.pairs, self.noun)
 
-    def _finish(self, stretch: Stretch) -> None:
-        """Submit the pairs at the seams of a finished stretch for which the stretch beyond is finished too."""
-        self.beside.update(stretch.seams)
-        for pair in stretch.seams:
+    def _finish(self, unit: WorkUnit) -> None:
+        """Submit the boundary pairs of a finished work unit whose other work unit is finished, too."""
+        self.beside.update(unit.boundary_pairs)
+        for pair in unit.boundary_pairs:
             if self.beside[pair] == 2:
                 del self.beside[pair]
                 self.ready.add(pair)
-                self.waiting.appendleft(Stretch((pair,)))
+                self.waiting.appendleft(WorkUnit((pair,)))
 
 
 def _fetched(future: Any, name: str) -> worker.Result | None:
@@ -242,8 +242,8 @@ def _checked(result: worker.Result) -> Sequence[Outcome]:
     return result.outcomes
 
 
-def _in_worker(shared: str, stretch: Stretch, topic: str, key: str) -> worker.Result:
-    """Do one stretch in a worker of Dask."""
+def _in_worker(shared: str, unit: WorkUnit, topic: str, key: str) -> worker.Result:
+    """Do one work unit in a worker of Dask."""
     from distributed import get_client, get_worker
     from distributed.comm.addressing import get_address_host
 
@@ -261,7 +261,7 @@ def _in_worker(shared: str, stretch: Stretch, topic: str, key: str) -> worker.Re
         places = list(client.run(_place, workers=near, on_error="return").values())
         return max(granted_cores() // max(places.count(_place()), 1), 1)
 
-    return worker.work_on(Path(shared), Stretch(*stretch), report, threads)
+    return worker.work_on(Path(shared), WorkUnit(*unit), report, threads)
 
 
 def _place() -> tuple[Any, ...]:

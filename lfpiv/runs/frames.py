@@ -1,6 +1,6 @@
 """Volumes of frames: read or reconstruct each frame once, and use its volume in all its pairs.
 
-`Frames` goes along a stretch of pairs and holds both frames of the present pair, each reconstructed by itself. A frame
+`Frames` goes along a work unit and holds both frames of the present pair, each reconstructed by itself. A frame
 that fails is kept as a failure, so that all its pairs name the same reason. `JointFrames` fits both frames of a pair
 together; `lfpiv.runs.sequences` follows frames along a series.
 """
@@ -62,7 +62,7 @@ class HeldFrame:
 
 @dataclass(eq=False)
 class Frames:
-    """The frames of the present pair of a stretch, each reconstructed by itself.
+    """The frames of the present pair of a work unit, each reconstructed by itself.
 
     Volumes are taken from the output folder, from another process (`FrameWork.scratch`), or reconstructed.
     """

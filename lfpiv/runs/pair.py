@@ -1,6 +1,6 @@
 """The work on pairs: images to volumes to vectors, and files of both.
 
-`PairWork.do` takes a stretch of pairs and yields the `Outcome` of each. Volumes that are in the output folder and still
+`PairWork.do` takes pairs and yields the `Outcome` of each. Volumes that are in the output folder and still
 fit are read instead of reconstructed. Each frame is reconstructed once, for all its pairs (`lfpiv.runs.frames`).
 """
 

@@ -17,7 +17,7 @@ CORRELATED = 0.99
 """Finished fraction of a pair when only its vectors remain to be written."""
 
 PairProgress = Callable[[int, float], None]
-"""Called as ``progress(number, fraction)``: the place of a pair in its stretch, from 0, and its finished fraction."""
+"""Called as ``progress(number, fraction)``: the place of a pair in its work unit, from 0, and its finished fraction."""
 
 
 @dataclass(frozen=True, kw_only=True)

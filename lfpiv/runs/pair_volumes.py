@@ -202,8 +202,8 @@ def reconstruction_s(experiment: Experiment, pair: int, volumes: PairVolumes) ->
     all pairs then counts each instant once.
     """
     first, second = (record.seconds for record in volumes.records)
-    chain = experiment.recording.chain
-    return second if chain is not None and pair - chain in experiment.numbers else first + second
+    step = experiment.recording.shared_step
+    return second if step is not None and pair - step in experiment.numbers else first + second
 
 
 def _as_written(volume: xr.DataArray, grid: Grid) -> xr.DataArray:

@@ -225,7 +225,7 @@ class Run:
             return changed
 
         stored = self.folder.stored(self.numbers, vectors=vectors, volumes=volumes)
-        step = 1 if self.experiment.in_sequence else self.experiment.recording.chain or 1
+        step = 1 if self.experiment.in_sequence else self.experiment.recording.shared_step or 1
         pending = PendingPairs(
             self.numbers, stored, changes, self.step("stored results"), step=step, noun=self.experiment.noun
         )

@@ -1,6 +1,6 @@
 """Volumes of a time series whose instants are reconstructed one after the other, each from the one before.
 
-`FollowedFrames` goes along the pairs k, k + 1, k + 2, ... of a stretch and holds the instants from the first to the
+`FollowedFrames` goes along the pairs k, k + 1, k + 2, ... of a work unit and holds the instants from the first to the
 second one of the present pair. Each is corrected by the few instants before and after it, so images are read ahead. The
 instants of a segment are always reconstructed from the same beginning
 (`lfpiv.experiment.segments`), so the numbers do not depend on the pairs that are asked for, on the processes, or on
@@ -31,7 +31,7 @@ from lfpiv.warn import Code, Warning
 
 @dataclass(eq=False)
 class FollowedFrames(Frames):
-    """The frames of the present pair of a stretch, and those between them."""
+    """The frames of the present pair of a work unit, and those between them."""
 
     sequences: dict[int, Segment] = field(default_factory=dict)
     """Number of a segment -> its frames so far."""

@@ -1,7 +1,7 @@
-"""Work of a worker process: one stretch of pairs at a time, with weights that all processes of a machine share.
+"""Work of a worker process: one work unit of pairs at a time, with weights that all processes of a machine share.
 
 The run writes a task into a folder (`lfpiv.runs.task`). A worker opens it once and uses it for all its pairs. It gets
-the name of that folder and a stretch, and returns a `Result`.
+the name of that folder and a work unit, and returns a `Result`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from lfpiv.errors import InputError, StorageError
 from lfpiv.runs import background, memory
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import CORRELATED, Outcome, PairProgress
-from lfpiv.runs.stretches import Stretch
 from lfpiv.runs.task import TASK, WEIGHTS, read_task
+from lfpiv.runs.work_units import WorkUnit
 from lfpiv.version import __version__
 from lfpiv_kernels import runtime
 
@@ -33,7 +33,7 @@ REPORT_EVERY_S = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Result of the work on a stretch in a worker."""
+    """Result of a work unit in a worker."""
 
     outcomes: tuple[Outcome, ...] | None
     """Of all its pairs; None if no pair can be done; `fatal` says why."""
@@ -44,7 +44,7 @@ class Result:
     """Log records: logger, level, text."""
 
 
-_busy = threading.Lock()  # kernels and their scratch memory can be used by one stretch at a time
+_busy = threading.Lock()  # kernels and their scratch memory can be used by one work unit at a time
 _opened: dict[Path, PairWork] = {}
 _stopped: set[Path] = set()
 
@@ -53,14 +53,14 @@ class _Stopped(BaseException):
     """The run ended. No Exception, so that it is not taken for a failure of the pair."""
 
 
-def work_on(shared: Path, stretch: Stretch, report: Callable[[float], None], threads: Callable[[], int]) -> Result:
-    """Do a stretch of pairs of the task in the folder `shared`.
+def work_on(shared: Path, unit: WorkUnit, report: Callable[[float], None], threads: Callable[[], int]) -> Result:
+    """Do a work unit of the task in the folder `shared`.
 
     Parameters
     ----------
     shared : Path
         From `task.write_task`.
-    stretch : Stretch
+    unit : WorkUnit
         Pairs to do.
     report : callable
         Called with the number of finished pairs, and parts of one, at most once in `REPORT_EVERY_S`.
@@ -70,7 +70,7 @@ def work_on(shared: Path, stretch: Stretch, report: Callable[[float], None], thr
     with _busy, _captured_logs() as records:
         try:
             work = _open(shared, threads)
-            done = list(work.do(stretch.pairs, _throttled(shared, report), stored=stretch.stored))
+            done = list(work.do(unit.pairs, _throttled(shared, report), stored=unit.stored))
         except _Stopped:
             return Result(outcomes=None, fatal="stopped")
         except (StorageError, InputError) as error:
@@ -80,7 +80,7 @@ def work_on(shared: Path, stretch: Stretch, report: Callable[[float], None], thr
 
 
 def release(shared: Path) -> None:
-    """Forget a task and stop the work on its present stretch."""
+    """Forget a task and stop the work on its present work unit."""
     _stopped.add(shared)
     _opened.pop(shared, None)
 
@@ -118,7 +118,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
 
 
 def _throttled(shared: Path, report: Callable[[float], None]) -> PairProgress:
-    """Return the progress of a stretch: it reports at intervals, and stops the work if the run ended."""
+    """Return the progress of a work unit: it reports at intervals, and stops the work if the run ended."""
     last = -REPORT_EVERY_S
 
     def progress(number: int, fraction: float) -> None:

@@ -7,7 +7,7 @@ from operator import length_hint
 import pytest
 from support.small_run import PAIRS, write_empty_report
 
-from lfpiv.runs import pipeline, stretches, summary
+from lfpiv.runs import pipeline, summary, work_units
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.runs.pending_pairs import PendingPairs
@@ -66,8 +66,8 @@ def test_pairs_of_a_series_come_along_its_chains():
 def test_stretches_are_cut_as_they_are_needed():
     taken = []
     source = (taken.append(pair) or pair for pair in range(MANY))
-    first = next(stretches.cut(source, 1, 2))
-    assert first.pairs[0] == 0 and len(taken) <= 2 * stretches.MOST_INSTANTS
+    first = next(work_units.cut(source, 1, 2))
+    assert first.pairs[0] == 0 and len(taken) <= 2 * work_units.MOST_INSTANTS
 
 
 def figures(valid):

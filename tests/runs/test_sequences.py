@@ -16,7 +16,7 @@ from lfpiv.experiment import segments
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.results import netcdf, provenance
 from lfpiv.runs import dispatch
-from lfpiv.runs.stretches import cut_at_segments
+from lfpiv.runs.work_units import cut_at_segments
 from lfpiv.sequence import solver as sequence
 from lfpiv.warn import Code
 
@@ -66,10 +66,10 @@ def sequential(work, todo=None):
 
 
 def in_segments(work, workers, deaths=None):
-    """Do all pairs in stretches of a segment each; return their outcomes by pair, and the client."""
+    """Do all pairs in work units of a segment each; return their outcomes by pair, and the client."""
     client, todo = Processes(work, deaths), list(work.experiment.numbers)
-    stretches = cut_at_segments(todo, work.experiment.recording.step)
-    found = dispatch.Dispatch(client, lambda: workers, work.folder.path, stretches, len(todo), "instant")
+    units = cut_at_segments(todo, work.experiment.recording.step)
+    found = dispatch.Dispatch(client, lambda: workers, work.folder.path, units, len(todo), "instant")
     return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
 
 
@@ -93,18 +93,18 @@ def volumes(folder):
 @given(st.sets(st.integers(0, 200), min_size=1), st.integers(1, 90))
 def test_stretches_are_segments_and_cover_each_pair_once(chosen, step):
     todo = sorted(chosen)
-    stretches = list(cut_at_segments(todo, step))
-    seams = Counter(pair for stretch in stretches for pair in stretch.seams)
-    assert set(seams.values()) <= {2}, "a seam lies between two stretches"
-    assert sorted([*seams, *(pair for stretch in stretches for pair in stretch.pairs)]) == todo
+    units = list(cut_at_segments(todo, step))
+    boundary_pairs = Counter(pair for unit in units for pair in unit.boundary_pairs)
+    assert set(boundary_pairs.values()) <= {2}, "a boundary pair lies between two work units"
+    assert sorted([*boundary_pairs, *(pair for unit in units for pair in unit.pairs)]) == todo
     stored = Counter()
-    for stretch in stretches:
-        assert len({segments.segment_of(pair) for pair in stretch.pairs}) == 1
-        assert stretch.pairs == tuple(sorted(stretch.pairs))
-        reached = {instant for pair in stretch.pairs for instant in (pair, pair + step)}
-        assert set(stretch.stored) <= reached, "an instant that nobody reconstructs"
-        stored.update(stretch.stored)
-    assert set(stored) == {instant for pair in seams for instant in (pair, pair + step)}
+    for unit in units:
+        assert len({segments.segment_of(pair) for pair in unit.pairs}) == 1
+        assert unit.pairs == tuple(sorted(unit.pairs))
+        reached = {instant for pair in unit.pairs for instant in (pair, pair + step)}
+        assert set(unit.stored) <= reached, "an instant that nobody reconstructs"
+        stored.update(unit.stored)
+    assert set(stored) == {instant for pair in boundary_pairs for instant in (pair, pair + step)}
 
 
 @given(st.integers(0, 100), st.integers(2, 300), st.data())
@@ -154,7 +154,7 @@ def test_the_numbers_are_those_of_one_process_for_several_workers_and_deaths(mad
     work = changed(made[1], tmp_path / "out", instants=INSTANTS, scratch=tmp_path / "scratch")
     outcomes, client = in_segments(work, 3, {FIRST: [1]})
     assert sorted(outcomes) == list(work.experiment.numbers) and not any(one.reason for one in outcomes.values())
-    assert any(stretch.seams for stretch in client.submitted)
+    assert any(unit.boundary_pairs for unit in client.submitted)
     assert client.submitted.count(client.submitted[0]) == 2, "a worker died"
     assert not list((tmp_path / "scratch").iterdir()), "volumes that no one needs any more"
     assert same_vectors(reference, tmp_path / "out") == INSTANTS - 1
@@ -168,7 +168,7 @@ def test_the_step_changes_no_volume(made, reference, tmp_path, step=2):
     used = {frame.number for pair in one.experiment.numbers for frame in one.experiment.pair_frames(pair)}
     assert list(found) == [name(instant - FIRST) for instant in sorted(used)]
     assert all(np.array_equal(found[name], expected[name]) for name in found)
-    # seams whose two instants are both within a segment of pairs to do
+    # boundary pairs whose two instants are both within a segment of pairs to do
     many = changed(one, tmp_path / "many", step=step, instants=INSTANTS, scratch=tmp_path / "scratch")
     outcomes, _ = in_segments(dataclasses.replace(many, keep_volumes=False), 2)
     assert not any(one.reason for one in outcomes.values())

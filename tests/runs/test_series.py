@@ -27,7 +27,7 @@ from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume
 from lfpiv.runs import background, dispatch, guard, pipeline, refinement
 from lfpiv.runs.run import open_run
-from lfpiv.runs.stretches import MOST_INSTANTS, cut
+from lfpiv.runs.work_units import MOST_INSTANTS, cut
 from lfpiv.warn import Code, from_text
 
 INSTANTS = 6
@@ -81,21 +81,21 @@ TODO = st.tuples(st.integers(0, 50), st.sets(st.integers(0, 120), min_size=1), s
 def test_stretches_cover_each_pair_once_and_share_no_instant(case):
     first, chosen, step, workers = case
     todo = sorted(first + pair for pair in chosen)
-    stretches = list(cut(chained(todo, step), step, workers))
-    seams = Counter(pair for stretch in stretches for pair in stretch.seams)
-    assert set(seams.values()) <= {2}, "a seam lies between two stretches"
-    assert sorted([*seams, *(pair for stretch in stretches for pair in stretch.pairs)]) == todo
+    units = list(cut(chained(todo, step), step, workers))
+    boundary_pairs = Counter(pair for unit in units for pair in unit.boundary_pairs)
+    assert set(boundary_pairs.values()) <= {2}, "a boundary pair lies between two work units"
+    assert sorted([*boundary_pairs, *(pair for unit in units for pair in unit.pairs)]) == todo
     instants = Counter()
-    for stretch in stretches:
-        assert 1 <= len(stretch.pairs) < MOST_INSTANTS
-        assert all(after == before + step for before, after in zip(stretch.pairs, stretch.pairs[1:], strict=False))
-        own = {*stretch.pairs, stretch.pairs[-1] + step}
+    for unit in units:
+        assert 1 <= len(unit.pairs) < MOST_INSTANTS
+        assert all(after == before + step for before, after in zip(unit.pairs, unit.pairs[1:], strict=False))
+        own = {*unit.pairs, unit.pairs[-1] + step}
         instants.update(own)
-        assert set(stretch.stored) <= own
+        assert set(unit.stored) <= own
     assert set(instants.values()) <= {1} and set(instants) == {*todo, *(pair + step for pair in todo)}
-    stored = {instant for stretch in stretches for instant in stretch.stored}
-    assert stored == {instant for pair in seams for instant in (pair, pair + step)}
-    assert [stretch.pairs for stretch in cut(todo, None, workers)] == [(pair,) for pair in todo]
+    stored = {instant for unit in units for instant in unit.stored}
+    assert stored == {instant for pair in boundary_pairs for instant in (pair, pair + step)}
+    assert [unit.pairs for unit in cut(todo, None, workers)] == [(pair,) for pair in todo]
 
 
 @pytest.mark.parametrize("step", [1, pytest.param(3, marks=pytest.mark.slow)])
@@ -127,7 +127,7 @@ def test_several_workers_reconstruct_each_instant_once_with_equal_numbers(
     outcomes, client = in_processes(work, workers)
     assert sorted(outcomes) == list(work.experiment.numbers) and not any(one.reason for one in outcomes.values())
     assert solved == {"volumes": instants, "images": 2 * instants}
-    assert len(client.submitted) > workers and any(stretch.seams for stretch in client.submitted)
+    assert len(client.submitted) > workers and any(unit.boundary_pairs for unit in client.submitted)
     assert not list((tmp_path / "scratch").iterdir()), "volumes that no one needs any more"
     if step > 1:
         reference = tmp_path / "one"
@@ -146,7 +146,7 @@ def test_vectors_are_those_of_the_same_images_as_pairs(small_run, reference):
 def test_a_stretch_whose_worker_dies_goes_on_after_its_finished_pairs(made, reference, tmp_path, solved):
     work = changed(made[1], tmp_path / "out", scratch=tmp_path / "scratch")
     plain = list(cut(list(work.experiment.numbers), 1, 1))
-    longest = max(plain, key=lambda stretch: len(stretch.pairs))
+    longest = max(plain, key=lambda unit: len(unit.pairs))
     assert len(longest.pairs) == 2
     outcomes, client = in_processes(work, 1, {longest.pairs[0]: [1]})
     assert client.submitted.count(longest) == 2

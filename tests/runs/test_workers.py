@@ -26,7 +26,7 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.results import datasets, netcdf, provenance, stamps
 from lfpiv.runs import cluster_workers, dispatch, guard, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair_outcome import Outcome
-from lfpiv.runs.stretches import cut
+from lfpiv.runs.work_units import cut
 from lfpiv.runs.worker import Result
 from lfpiv.weights import storage
 from lfpiv_kernels.runtime import Device
@@ -177,8 +177,8 @@ class DeadlyClient:
     def __init__(self, deaths, result=None, how="error"):
         self.deaths, self.result, self.how, self.submitted, self.keys = dict(deaths), result, how, [], set()
 
-    def submit(self, function, shared, stretch, topic, name, *, key, pure, **options):
-        (pair,) = stretch.pairs
+    def submit(self, function, shared, unit, topic, name, *, key, pure, **options):
+        (pair,) = unit.pairs
         assert key not in self.keys, "the cluster would hand out what it knows under this key"
         self.keys.add(key)
         self.submitted.append(pair)
@@ -195,8 +195,8 @@ class DeadlyClient:
 
 def outcomes(client, todo, width=2):
     fractions = []
-    stretches = cut(todo, None, width)
-    work = dispatch.Dispatch(client, lambda: width, Path("shared"), stretches, len(todo))
+    units = cut(todo, None, width)
+    work = dispatch.Dispatch(client, lambda: width, Path("shared"), units, len(todo))
     found = list(work.outcomes(fractions.append))
     assert fractions == sorted(fractions) and fractions[-1] <= 1
     return {outcome.pair: outcome.reason for outcome in found}

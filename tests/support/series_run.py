@@ -12,7 +12,7 @@ from lfpiv.experiment.recording import Recording
 from lfpiv.results.folder import Folder
 from lfpiv.runs import dispatch, guard, refinement
 from lfpiv.runs.pair import PairWork
-from lfpiv.runs.stretches import cut
+from lfpiv.runs.work_units import cut
 from lfpiv.runs.worker import Result
 from lfpiv.weights.operator import build_weights
 
@@ -78,19 +78,19 @@ def chained(pairs, step: int) -> list[int]:
 
 
 class Processes:
-    """A client of Dask whose workers do their stretches at once, in this process; `deaths` tells when one dies.
+    """A client of Dask whose workers do their work units at once, in this process; `deaths` tells when one dies.
 
-    `deaths` maps the first pair of a stretch to a list: after how many pairs a worker dies of it, at each trial.
+    `deaths` maps the first pair of a work unit to a list: after how many pairs a worker dies of it, at each trial.
     """
 
     def __init__(self, work: PairWork, deaths=None):
         self.work, self.deaths, self.submitted = work, {key: list(value) for key, value in (deaths or {}).items()}, []
 
-    def submit(self, function, shared, stretch, topic, name, *, key, pure, **options):
-        self.submitted.append(stretch)
-        deaths = self.deaths.get(stretch.pairs[0], [])
+    def submit(self, function, shared, unit, topic, name, *, key, pure, **options):
+        self.submitted.append(unit)
+        deaths = self.deaths.get(unit.pairs[0], [])
         left, outcomes = deaths.pop(0) if deaths else None, []
-        for outcome in self.work.do(stretch.pairs, lambda number, fraction: None, stored=stretch.stored):
+        for outcome in self.work.do(unit.pairs, lambda number, fraction: None, stored=unit.stored):
             outcomes.append(outcome)
             if len(outcomes) == left:
                 return Done(key, "error", None)
@@ -120,9 +120,9 @@ class Done:
 
 
 def in_processes(work: PairWork, workers: int, deaths=None):
-    """Do all pairs in stretches for several workers; return their outcomes by pair, and the client."""
+    """Do all pairs in work units for several workers; return their outcomes by pair, and the client."""
     client = Processes(work, deaths)
     todo = chained(work.experiment.numbers, work.experiment.recording.step)
-    stretches = cut(todo, work.experiment.recording.step, workers)
-    found = dispatch.Dispatch(client, lambda: workers, Path("shared"), stretches, len(todo), "instant")
+    units = cut(todo, work.experiment.recording.step, workers)
+    found = dispatch.Dispatch(client, lambda: workers, Path("shared"), units, len(todo), "instant")
     return {outcome.pair: outcome for outcome in found.outcomes(lambda fraction: None)}, client
