@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -306,40 +306,60 @@ def judge(
     ValueError
         If the images of the pair cannot be reconstructed.
     """
+    trials = _Trials(fit, shown, pair, others)
     cameras = list(fit.weights.cameras)
-    left: dict[Mistake, list[np.ndarray]] = {}
+    likely = [RIGHT, *trials.chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
+    found = trials.judged(likely, 1)
+    if not thorough and (settled := trials.settled(found, single_images=bool(images))) is not None:
+        return settled
+    found = trials.judged([*likely, *trials.chance, *other_mistakes(cameras, near, images)], 2)
+    likeliest = found.tried[0]
+    if found.margin(likeliest) > -SURE:
+        return found
+    return replace(found, turned={likeliest: trials.turned(likeliest)})
 
-    def try_frames(mistakes: Iterable[Mistake], count: int) -> Judgement:
+
+class _Trials:
+    """Trials of mistakes with the images of a pair; the arguments are those of `judge`."""
+
+    def __init__(self, fit: ImageFit, shown: Shown, pair: int, others: Sequence[int]):
+        self._fit, self._shown, self._pair = fit, shown, pair
+        self._left: dict[Mistake, list[np.ndarray]] = {}
+        cameras = list(fit.weights.cameras)
+        late = [number for number in others if shown(pair + number, 0) is not None]
+        of_other_pairs = [Mistake(Kind.LATE, (name,), number) for number in late for name in _one_of_two(cameras)]
+        self.chance = of_other_pairs or [Mistake(Kind.CHANCE, (name,)) for name in cameras]
+        """What replaces an image by that of other particles."""
+
+    def judged(self, mistakes: Iterable[Mistake], count: int) -> Judgement:
+        """Try mistakes with the first `count` frames; return the judgement by all trials so far."""
         for frame in range(count):
             for one in mistakes:
-                tried = left.setdefault(one, [])
-                if len(tried) == frame and (right := one.undone(shown, pair, frame)) is not None:
-                    tried.append(fit.unexplained(right, one.cameras[0] if one.kind is Kind.CHANCE else None))
-        known = {one: tried for one, tried in left.items() if tried}
-        return Judgement(known, [one for one in chance if one in known])
+                left = self._left.setdefault(one, [])
+                if len(left) == frame and (right := one.undone(self._shown, self._pair, frame)) is not None:
+                    left.append(self._fit.unexplained(right, one.cameras[0] if one.kind is Kind.CHANCE else None))
+        known = {one: left for one, left in self._left.items() if left}
+        return Judgement(known, [one for one in self.chance if one in known])
 
-    shifts = [late for late in others if shown(pair + late, 0) is not None]
-    chance = [Mistake(Kind.LATE, (name,), late) for late in shifts for name in _one_of_two(cameras)]
-    if not chance:
-        chance = [Mistake(Kind.CHANCE, (name,)) for name in cameras]
-    likely = [RIGHT, *chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
-    found = try_frames(likely, 1)
-    ordering = [one for one in likely if one is RIGHT or one.kind is Kind.FRAMES]
-    if found.in_order and not thorough:
-        if not images:
+    def settled(self, found: Judgement, single_images: bool) -> Judgement | None:
+        """Return the judgement if the images fit and at most the order of frames is in doubt, otherwise None.
+
+        `found` is the judgement by the first frame. `single_images`: a camera may be late by single images.
+        """
+        if found.in_order and not single_images:
             return found
-        found = try_frames([RIGHT, chance[0]], 2)  # no other pair has this second frame
-        if found.fits:
-            return found
-    elif found.fits and not thorough:
-        found = try_frames(ordering, 2)
-        each = [advantage(left[RIGHT][at : at + 1], left[one][at : at + 1]) for one in ordering[1:] for at in (0, 1)]
-        if found.fits and min(each) > -SURE:
-            return found
-    found = try_frames([*likely, *chance, *other_mistakes(cameras, near, images)], 2)
-    best = found.tried[0]
-    if found.margin(best) > -SURE:
-        return found
-    undone = [right for frame in (0, 1) if (right := best.undone(shown, pair, frame)) is not None]
-    turned = {best: [fit.unexplained(right, best.cameras[0]) for right in undone]}
-    return Judgement(found.left, found.chance, turned)
+        if found.in_order:
+            found = self.judged([RIGHT, self.chance[0]], 2)  # no other pair has this second frame
+            return found if found.fits else None
+        if not found.fits:
+            return None
+        order = [one for one in self._left if one.kind is Kind.FRAMES]
+        found = self.judged([RIGHT, *order], 2)
+        each = [[self._left[one][at : at + 1] for one in (RIGHT, *order)] for at in (0, 1)]
+        least = min(advantage(right, exchanged) for right, *others in each for exchanged in others)
+        return found if found.fits and least > -SURE else None
+
+    def turned(self, mistake: Mistake) -> list[np.ndarray]:
+        """Return the light that is unexplained without a mistake and with the image of its camera turned."""
+        frames = (mistake.undone(self._shown, self._pair, frame) for frame in (0, 1))
+        return [self._fit.unexplained(images, mistake.cameras[0]) for images in frames if images is not None]
