@@ -31,7 +31,7 @@ from lfpiv.metrics.particles import match_particles
 from lfpiv.reproduce.rigs import VOXEL_MM
 from lfpiv.tracking.finding import ParticleSearch
 from lfpiv.tracking.fit import Fit
-from lfpiv.tracking.following import Candidates, Followed, follow
+from lfpiv.tracking.following import Candidates, TrackedParticles, follow
 from lfpiv.tracking.found import FoundParticles
 from lfpiv.tracking.linking import link_particles
 from lfpiv.tracking.pairing import exchange
@@ -53,7 +53,7 @@ def links_of(search: ParticleSearch, fits: Sequence[Fit]) -> list[xr.Dataset]:
 
 def followed(
     search: ParticleSearch, tables: Sequence[xr.Dataset], images: Sequence[dict[str, np.ndarray]], noise: list
-) -> Followed:
+) -> TrackedParticles:
     """Follow the particles over all instants."""
     size = float(np.median([table.attrs["sigma_voxel"] for table in tables]))
     sized = replace(search, sigma_voxel=size)

@@ -2,7 +2,8 @@
 
     python perf/accuracy/run.py [CASE ...] --out DIR [--scale small|paper] [--seed N]
 
-Cases: real optics, choices of method, imperfect experiments, a time series. Cameras and seeding: `table`.
+Cases: real optics, choices of method, imperfect experiments. Cameras and seeding: `table`; time series:
+`predicted_series`.
 All are computed where none is named.
 """
 
@@ -17,7 +18,7 @@ from lfpiv.reproduce.study import SCALES, Study, compute
 ACCURACY = Study(
     title="Beyond the paper",
     about="Cases beyond the paper, on rigs with the same main lens and microlenses, smaller volumes and noisy images",
-    modules={key: key for key in ("optics", "choices", "imperfections", "dns_series")},
+    modules={key: key for key in ("optics", "choices", "imperfections")},
 )
 
 
