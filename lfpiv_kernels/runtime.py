@@ -137,16 +137,27 @@ def _start(request: str, threads: int | None) -> Device:
     form = "gpu" if kind == "cuda" or native.EMULATED else "cpu"
     count = 1 if native.EMULATED else threads or cores()  # a GPU adds atomically, the CPU's threads do not
 
-    from lfpiv_kernels.libraries import ti
-
     compiled = caches.taichi_folder()
     _taichi_folder = None if caches.verify_taichi(compiled) else compiled
+    _start_taichi(kind, count, compiled)
+    _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
+    _device = Device(kind, count, form, reason, **_described(kind))
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_forget_threads)
+    log.info("kernels run on %s", _device.sentence)
+    return _device
+
+
+def _start_taichi(kind: str, threads: int, compiled: Path) -> None:
+    """Start Taichi with a folder of compiled kernels, which is sealed when the process ends."""
+    from lfpiv_kernels.libraries import ti
+
     named = {} if "TI_OFFLINE_CACHE_FILE_PATH" in os.environ else {"offline_cache_file_path": str(compiled)}
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints a line that log_level does not silence
             ti.init(
                 arch=getattr(ti, TAICHI or kind),
-                cpu_max_num_threads=count,
+                cpu_max_num_threads=threads,
                 log_level=ti.ERROR,
                 offline_cache=True,
                 fast_math=True,
@@ -162,12 +173,6 @@ def _start(request: str, threads: int | None) -> Device:
     if TAICHI and ti.cfg.arch != getattr(ti, TAICHI):  # Taichi takes the CPU without a word
         raise RuntimeError(f"LFPIV_TAICHI: Taichi finds no driver for {TAICHI!r}.")
     atexit.register(caches.seal_taichi, compiled, ti.reset)
-    _pool = ThreadPoolExecutor(count, thread_name_prefix="lfpiv")
-    _device = Device(kind, count, form, reason, **_described(kind))
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_forget_threads)
-    log.info("kernels run on %s", _device.sentence)
-    return _device
 
 
 def _described(kind: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import json
 import logging
 from dataclasses import replace
 
-from lfpiv.runs import summary
+from lfpiv.runs import result_warnings
 from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import SENTENCES, Code, FirstOfEachCode, Warning, collected, gather, warn
@@ -54,7 +54,7 @@ def test_warnings_of_several_pairs_are_gathered():
 def test_many_pairs_with_the_same_trouble_are_one_line():
     (found,) = gather(dark(0.1 + number / 1e4).of_pair(number) for number in range(1000))
     assert found.sentence.startswith("left, frame a, pairs 0, 1, 2, 3, 4 and 995 more: 10 to 20 % of the bright pixels")
-    (few,) = gather(one for pair in (3, 5) for one in summary.pair_warnings(pair, figures("look", 0.01 * pair)))
+    (few,) = gather(one for pair in (3, 5) for one in result_warnings.pair_warnings(pair, figures("look", 0.01 * pair)))
     assert few.sentence == "pairs 3, 5: 3 to 5 % of the vectors are valid; look"
 
 
@@ -64,7 +64,7 @@ def test_volumes_that_explain_little_are_named():
     pairs = {
         pair: replace(figures(good, 1.0), residual={"a": [0.95, 0.4], "b": [0.99, end]}) for pair, end in last.items()
     }
-    (found,) = gather(one for pair, known in pairs.items() for one in summary.pair_warnings(pair, known))
+    (found,) = gather(one for pair, known in pairs.items() for one in result_warnings.pair_warnings(pair, known))
     assert found.code is Code.UNEXPLAINED and found.sentence.startswith("pairs 2, 4: the volumes explain little")
     assert "residual 0.80 to 0.90;" in found.sentence
 

@@ -148,9 +148,26 @@ class _Columns:
     attributes: Mapping[str, Any]
     of_particles: bool
 
-    def stated(self, *names: str) -> np.ndarray | None:
+    def has(self, roles: Sequence[str]) -> bool:
+        """Return whether all of some roles have values."""
+        return all(role in self.values for role in roles)
+
+    def in_mm(self, roles: Sequence[str], rows: np.ndarray, stated: Mapping[str, str], **scale: float) -> np.ndarray:
+        """Return some rows of some roles [mm], shape (row, role); NaN for marks of missing values.
+
+        `stated` are units that the file does not have; `scale` is that of `names.to_mm`.
+        """
+        values = []
+        for role in roles:
+            name = self.named[role]
+            unit = names.stated_unit(role, name, self.units.get(role), stated, str(self.path))
+            values.append(names.to_mm(self.values[role][rows], unit, f"{self.path}: {name}", **scale))
+        found = np.stack(values, axis=1)
+        return np.where(np.abs(found) < LONGEST_MM, found, np.nan)
+
+    def stated(self, *keys: str) -> np.ndarray | None:
         """Return the numbers of the first attribute of some names, one or more; None without; refuse others."""
-        name = next((name for name in names if name in self.attributes), None)
+        name = next((name for name in keys if name in self.attributes), None)
         if name is None:
             return None
         try:
@@ -190,42 +207,37 @@ def _field(columns: _Columns, rows: np.ndarray, number: int, truth: Truth, optio
     if edges is not None and not (np.allclose(edges, edges[0]) and edges[0] > 0):
         raise InputError(f"{columns.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
     voxel_mm = truth.voxel_mm if edges is None else float(edges[0])
-
-    def along(roles: Sequence[str], **scale: float) -> np.ndarray | None:
-        if not all(role in columns.values for role in roles):
-            return None
-        values = []
-        for role in roles:
-            name = columns.named[role]
-            unit = names.stated_unit(role, name, columns.units.get(role), options.units, str(columns.path))
-            values.append(names.to_mm(columns.values[role][rows], unit, f"{columns.path}: {name}", **scale))
-        found = np.stack(values, axis=1)
-        return np.where(np.abs(found) < LONGEST_MM, found, np.nan)
-
     scale = {"dt_s": truth.scene.dt_s, "voxel_mm": voxel_mm}
-    moved = names.VELOCITY if all(role in columns.values for role in names.VELOCITY) else names.DISPLACEMENT
-    position, displacement = along(names.POSITION), along(moved, **scale)
-    assert position is not None and displacement is not None  # `names.find_names` requires them
+    moved = names.VELOCITY if columns.has(names.VELOCITY) else names.DISPLACEMENT
+    position = columns.in_mm(names.POSITION, rows, options.units)
+    told = columns.has(names.UNCERTAINTY)
+    uncertainty = columns.in_mm(names.UNCERTAINTY, rows, options.units, **scale) if told else None
     flag = columns.values.get(names.VALID)
-    is_particles = options.kind == "particles" or (options.kind == "auto" and columns.of_particles)
-    if options.kind == "auto" and not is_particles:
-        finite = np.isfinite(position).all(1)
-        is_particles = lattice_of(position[finite], truth.voxel_mm) is None and bool(finite.any())
+    is_particles = _are_particles(columns, position, truth, options.kind)
     memory = columns.stated("memory_mib", "peak_memory_mib")
     in_voxels = any(columns.units.get(role, "").lower() in names.VOXEL_UNITS for role in moved)
     note = f"no attribute voxel_mm: voxels are taken to be the data set's, {truth.voxel_mm:g} mm"
     return MeasuredField(
         number=number,
         positions_mm=position,
-        displacement_mm=displacement,
+        displacement_mm=columns.in_mm(moved, rows, options.units, **scale),
         valid=np.ones(len(position), bool) if flag is None else np.nan_to_num(flag[rows]) > 0,
-        uncertainty_mm=along(names.UNCERTAINTY, **scale),
+        uncertainty_mm=uncertainty,
         window_mm=None if is_particles else options.window_mm or _window_mm(columns, voxel_mm),
         is_particles=is_particles,
         seconds=_seconds(columns) if options.seconds is None else options.seconds,
         memory_mib=None if memory is None else float(memory[0]),
         notes=(note,) if in_voxels and edges is None else (),
     )
+
+
+def _are_particles(columns: _Columns, position_mm: np.ndarray, truth: Truth, kind: str) -> bool:
+    """Return whether vectors belong to particles: as stated, or because they lie on no lattice."""
+    if kind != "auto":
+        return kind == "particles"
+    finite = np.isfinite(position_mm).all(1)
+    scattered = bool(finite.any()) and lattice_of(position_mm[finite], truth.voxel_mm) is None
+    return columns.of_particles or scattered
 
 
 def _window_mm(columns: _Columns, voxel_mm: float) -> Point | None:
@@ -307,11 +319,7 @@ def _load_table(path: Path) -> xr.Dataset:
 def _columns(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
     """Return the vectors of a file, whatever the order of its axes."""
     dataset = _load_table(path) if path.suffix.lower() in TABLES else load_netcdf(path)
-    about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
-    for name in set(about) & set(map(str, dataset.coords)):
-        axis = str(about[name].get("axis", "")).lower()
-        if axis in names.POSITION and name.lower() not in names.COMMON_NAMES[axis] and dataset[name].ndim == 1:
-            about[name]["standard_name"] = names.STANDARD_NAMES[axis][0]
+    about = _attributes_of(dataset)
     named = names.find_names(about, options.names, str(path))
     for name in named.values():
         if (text := about[name].get("text")) is not None and dataset[name].dims == (ROW,):
@@ -336,6 +344,16 @@ def _columns(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
         attributes=dataset.attrs,
         of_particles=PARTICLE in base,
     )
+
+
+def _attributes_of(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Return the attributes of variables of numbers; a coordinate that states its axis gets the standard name."""
+    about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
+    for name in set(about) & set(map(str, dataset.coords)):
+        axis = str(about[name].get("axis", "")).lower()
+        if axis in names.POSITION and name.lower() not in names.COMMON_NAMES[axis] and dataset[name].ndim == 1:
+            about[name]["standard_name"] = names.STANDARD_NAMES[axis][0]
+    return about
 
 
 def _pair_dimension(path: Path, dataset: xr.Dataset, named: Mapping[str, str], base: set[Any]) -> str | None:

@@ -157,15 +157,11 @@ def score_fields(
             f"{source}: expected vectors in the measurable region, found none of {_found(pairs)}. Are x, y and z "
             "in the data set's axes and in the unit that is stated?"
         )
-    found = metrics.block_bootstrap(sample.statistics, sample.block, resamples=options.resamples)
     first = next(iter(by_number.values()))
-    window = first.window_mm
+    found = metrics.block_bootstrap(sample.statistics, sample.block, resamples=options.resamples)
     found["completeness"] = _mean_of([one.completeness for one in pairs])
     found["divergence"] = _mean_of([divergence(one, truth) for one in pairs if one.scored.any()])
-    found |= {key: _exact(value) for key, value in in_time(pairs).items()}
-    times = [one.seconds for one in fields if one.seconds is not None]
-    found["seconds"] = _exact(float(np.median(times)) if times else np.nan)
-    found["memory"] = _exact(max((one.memory_mib for one in fields if one.memory_mib is not None), default=np.nan))
+    found |= {key: _exact(value) for key, value in (in_time(pairs) | _costs(fields)).items()}
     if first.is_particles:
         found |= _particle_figures(truth, by_number, numbers)
     if options.volumes is not None:
@@ -177,9 +173,16 @@ def score_fields(
         instants=tuple(_of_pair(one, truth, options.outlier_voxel) for one in pairs),
         curve=sample.curve(),
         sample=sample,
-        window_mm=window,
+        window_mm=first.window_mm,
         notes=_notes(pairs, first, truth),
     )
+
+
+def _costs(fields: Sequence[MeasuredField]) -> dict[str, float]:
+    """Return the median time of a pair and the largest memory; NaN where no file states them."""
+    seconds = [one.seconds for one in fields if one.seconds is not None]
+    memory = [one.memory_mib for one in fields if one.memory_mib is not None]
+    return {"seconds": float(np.median(seconds)) if seconds else np.nan, "memory": max(memory, default=np.nan)}
 
 
 def chosen_numbers(truth: Truth, pairs: tuple[int, int | None] | None) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ SHOWN_CHARACTERS = 80
 WIDEST_FIELD = 20
 """Largest width of a number in a path pattern, as in ``{pair:04d}`` [character]."""
 
-_WIDTH = re.compile("(0?([1-9]|1[0-9]|20))?d?")
+NUMBER_FORMAT = re.compile("(0?([1-9]|1[0-9]|20))?d?")
 """Format of a number in a path pattern; widths up to `WIDEST_FIELD`."""
 
 LONGEST_PATH_BYTES = 4095
@@ -40,11 +40,9 @@ def check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any],
         unknown = _shortened(min(used - set(fields)))
         raise InputError(f"{path}: {key}: expected only {known}, found {{{unknown}}} in {shown}.")
     for _, name, width, conversion in parts:
-        is_number = isinstance(fields[str(name)], range)
-        if conversion or not (_WIDTH.fullmatch(width or "") if is_number else not width):
-            allowed = f"{{{name}}}" + (f", or {{{name}:04d}} with a width up to {WIDEST_FIELD}" if is_number else "")
-            found = _shortened(f"{name}{'!' + conversion if conversion else ''}{':' + width if width else ''}")
-            raise InputError(f"{path}: {key}: expected {allowed}, found {{{found}}}.")
+        wrong = _wrong_format(str(name), width or "", conversion or "", is_number=isinstance(fields[str(name)], range))
+        if wrong is not None:
+            raise InputError(f"{path}: {key}: {wrong}")
     for name, values in fields.items():
         if len(values) > 1 and name not in used and not optional:
             raise InputError(
@@ -55,6 +53,15 @@ def check_pattern(path: Path, key: str, pattern: str, fields: Mapping[str, Any],
         for name, values in fields.items()
     }
     check_length(path, key, pattern.format(**longest))
+
+
+def _wrong_format(name: str, width: str, conversion: str, *, is_number: bool) -> str | None:
+    """Say which format a field may have instead of its own; None if that is right."""
+    if not conversion and (NUMBER_FORMAT.fullmatch(width) if is_number else not width):
+        return None
+    allowed = f"{{{name}}}" + (f", or {{{name}:04d}} with a width up to {WIDEST_FIELD}" if is_number else "")
+    found = _shortened(name + (f"!{conversion}" if conversion else "") + (f":{width}" if width else ""))
+    return f"expected {allowed}, found {{{found}}}."
 
 
 def check_length(path: Path, key: str, name: str) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,24 +53,33 @@ def explain(text: str, error: tomllib.TOMLDecodeError) -> str:
         "line 7, `voxel_mm = 0,7`: expected a point in a decimal number. Write `voxel_mm = 0.7`."
     """
     lines, said = text.splitlines() or [""], _PLACE.sub("", str(error))
-    place = _PLACE.search(str(error))
-    number, column = (
-        (len(lines) - 1, 0) if place is None or place[1] is None else (int(place[1]) - 1, int(place[2]) - 1)
-    )
-    number = min(number, len(lines) - 1)
+    number, column = _place_of(error, lines)
     if said == 'Expected "\'"':  # the parser looks for it until the end of the text
         number = next((at for at, line in enumerate(lines) if line.count("'") % 2 and not _parses(line)), number)
     line = lines[number]
     where = f"line {number + 1}, " + (_shown(line) if line.strip() else "which is empty")
-    if len(line) <= LONGEST_LINE and not _parses(line):
-        for pattern, expected, meant in _RULES:
-            changed = (re.sub(pattern, new, line) for new in ((meant,) if callable(meant) else meant))
-            if mended := [_shown(one) for one in dict.fromkeys(changed) if one != line and _parses(one)]:
-                way = expected if expected.endswith(".") else f"{expected}. Write {', or '.join(mended)}."
-                return f"{where}: expected {way}"
+    if len(line) <= LONGEST_LINE and not _parses(line) and (way := _mended(line)) is not None:
+        return f"{where}: expected {way}"
     found = repr(line[column:].strip()[:20]) if line[column:].partition("#")[0].strip() else "none"
     known = (plain.format(found=found) for start, plain in _PLAIN.items() if said.startswith(start))
     return f"{where}: {next(known, said[:1].lower() + said[1:])}."
+
+
+def _place_of(error: tomllib.TOMLDecodeError, lines: Sequence[str]) -> tuple[int, int]:
+    """Return the line and the column that the parser names, from 0; it names none at the end of the text."""
+    place = _PLACE.search(str(error))
+    if place is None or place[1] is None:
+        return len(lines) - 1, 0
+    return min(int(place[1]), len(lines)) - 1, int(place[2]) - 1
+
+
+def _mended(line: str) -> str | None:
+    """Return what the first rule that mends a line expects; None if none does."""
+    for pattern, expected, meant in _RULES:
+        changed = (re.sub(pattern, new, line) for new in ((meant,) if callable(meant) else meant))
+        if mended := [_shown(one) for one in dict.fromkeys(changed) if one != line and _parses(one)]:
+            return expected if expected.endswith(".") else f"{expected}. Write {', or '.join(mended)}."
+    return None
 
 
 def _shown(line: str) -> str:

@@ -25,6 +25,7 @@ from lfpiv.runs import (
     task,
     tracks,
     unchanged,
+    usable_images,
     worker_plan,
 )
 from lfpiv.runs.invocation import Invocation, Tried, WeightsFigures, Workers
@@ -223,7 +224,7 @@ def _check(current: Run, pending: PendingPairs, workers: int | None, scheduler: 
     gpus = worker_plan.visible_gpus() if current.device.kind == "cuda" else ()
     some = bool(pending.ahead())
     planned = worker_plan.plan(length_hint(pending), workers, current.device, gpus)
-    failed = current.check_images(pending) if some else None
+    failed = usable_images.check_images(current, pending) if some else None
     if some and failed is None:
         finest = current.reconstructed_experiment
         needed = memory.weights_bytes(finest, current.particle_voxel) if current.need_weights(pending) else 0

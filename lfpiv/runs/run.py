@@ -18,9 +18,9 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment import recorded, recorded_times
+from lfpiv.experiment import recorded_times
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.experiment.opening import CHECKED_PAIRS, check_pairs, read_experiment
+from lfpiv.experiment.opening import read_experiment
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
@@ -39,7 +39,7 @@ from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.reversed_pairs import reversed_pairs
 from lfpiv.runs.summary import Contents, EarlierSummary
-from lfpiv.warn import NAMED_PAIRS, Gathering, Warning, collected, name_pairs, warn
+from lfpiv.warn import Gathering, Warning, collected, warn
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
@@ -252,69 +252,6 @@ class Run:
             return False
         stored = self.folder.stored(self.numbers, vectors=False, volumes=True)
         return not all(stored) or not all(map(self.has_volumes, self.numbers))
-
-    def check_images(self, pending: PendingPairs) -> Tried | None:
-        """Check the images of the next pairs and log those that cannot be used; None if the pairs can be tried.
-
-        If some pairs can be done, all are tried, and the others fail when their turn comes. If none of the pairs to do
-        can be done, return their outcomes.
-
-        Raises
-        ------
-        InputError
-            If more pairs are stated than there are, or if the first pair cannot be used and no finished pair shows that
-            the experiment file is right.
-        """
-        known = pending.ahead()
-        self._tell_missing(known)
-        bad = dict(check_pairs(self.experiment, [pair for pair in known if not self.has_volumes(pair)]))
-        whole = pending.whole and len(bad) == len(known)
-        if bad and known[0] in bad and not self._has_results():
-            noun = self.experiment.noun
-            others = "" if whole else f" To do the {noun}s after it, use --pairs {known[0] + 1}:."
-            raise InputError(bad[known[0]] + others)
-        if whole:
-            tried = Tried(self.numbers)
-            for pair, reason in bad.items():
-                self.record(Outcome(pair=pair, reason=reason), tried)
-            return tried
-        for reason in list(dict.fromkeys(bad.values()))[:NAMED_PAIRS]:
-            log.error("%s The other %ss will be done.", reason, self.experiment.noun)
-        if len(bad) > NAMED_PAIRS:
-            names = name_pairs(list(bad), self.experiment.noun)
-            log.error("%d %ss have images that cannot be used: %s", len(bad), self.experiment.noun, names)
-        return None
-
-    def _tell_missing(self, known: Sequence[int]) -> None:
-        """Refuse a run on pairs beyond the last one with images; log missing images that `known` does not tell of."""
-        absent = recorded.missing(self.experiment)
-        if absent is None:
-            return
-        first, end = self.numbers.start, absent.pairs_at_end
-        beyond = any(pair in self.numbers and not self._is_stored(pair) for pair in end)
-        if beyond or (absent.counts_from_one and first == self.experiment.numbers.start):
-            some = f" To do the {self.experiment.noun}s that are there, use --pairs {first}:{end.start}."
-            raise InputError(absent.message() + (some if beyond and first < end.start else ""))
-        told = set(known)
-        within = (pair for gap in absent.gaps for pair in gap if pair in self.numbers and pair not in told)
-        if end or any(not self._is_stored(pair) for pair in within):
-            log.warning("%s", absent.message())
-
-    def _is_stored(self, pair: int) -> bool:
-        """Return whether there is a file with the vectors of a pair."""
-        return self.folder.vectors(pair).is_file()
-
-    def _has_results(self) -> bool:
-        """Return whether some pair of the experiment is finished; of many pairs with files the first are examined."""
-        numbers = self.experiment.numbers
-        vectors = self.folder.stored(numbers, vectors=True, volumes=False)
-        volumes = self.folder.stored(numbers, vectors=False, volumes=True)
-        stored = (pair for pair, one, other in zip(numbers, vectors, volumes, strict=True) if one or other)
-        return any(map(self._is_finished, itertools.islice(stored, CHECKED_PAIRS)))
-
-    def _is_finished(self, pair: int) -> bool:
-        found = self.files(pair)
-        return found.fitting_vectors() is not None or found.fitting_volumes() is not None
 
     def require_whole(self) -> None:
         """Verify the results that a report shows, where they cannot be made again.

@@ -7,7 +7,7 @@ sensor is the measure of chance: it grows where particles are few or unequal.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,19 +138,31 @@ def find(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[DarkPart]:
         for name in solvers if number else cells:
             seen[name] = seen[name] + sum(cells[name].light(images[name]) for images in pair)
         if not number:
-            even = np.ones(weights.grid.shape, np.float32)
-            dark = [name for name, one in cells.items() if one.darkest(seen[name], one.projected(even))]
-            settings = SmartSettings(iterations=ITERATIONS, **PLAIN)
-            solvers = {name: SmartSolver(weights.without(name), settings) for name in dark}
+            solvers = _solvers_of_others(weights, cells, seen)
         for name, solver in solvers.items():
-            for images in pair:
-                volume = solver.solve({other: images[other] for other in solver.weights.cameras}).volume
+            for volume in _volumes(solver, pair):
                 expected[name] = expected[name] + cells[name].projected(volume)
         found = [part for name in solvers if (part := cells[name].darkest(seen[name], expected[name]))]
         clear = [part for part in found if part.lack > CLEAR and _stands_out(part, found)]
         if clear or not any(STANDS_OUT * part.lack > CLEAR for part in found):
             break
     return clear
+
+
+def _solvers_of_others(
+    weights: Weights, cells: Mapping[str, _Cells], seen: Mapping[str, np.ndarray]
+) -> dict[str, SmartSolver]:
+    """Return, for each camera with a dark region in the light that it has seen, a solver of the other cameras."""
+    even = np.ones(weights.grid.shape, np.float32)
+    dark = [name for name, one in cells.items() if one.darkest(seen[name], one.projected(even))]
+    settings = SmartSettings(iterations=ITERATIONS, **PLAIN)
+    return {name: SmartSolver(weights.without(name), settings) for name in dark}
+
+
+def _volumes(solver: SmartSolver, pair: Sequence[Images]) -> Iterator[np.ndarray]:
+    """Yield the volumes of a pair by the cameras of a solver."""
+    for images in pair:
+        yield solver.solve({name: images[name] for name in solver.weights.cameras}).volume
 
 
 def _stands_out(part: DarkPart, found: Iterable[DarkPart]) -> bool:

@@ -14,15 +14,13 @@ import numpy as np
 import tifffile
 
 from lfpiv import hdf5
+from lfpiv.experiment.patterns import NUMBER_FORMAT
 
 FIELDS = {"camera", "instant"}
 """Fields of the path of a series' images."""
 
 TIFF, HDF5 = (".tif", ".tiff"), (".h5", ".hdf5")
 """Endings of the files that are written."""
-
-WIDTH = re.compile("(0?([1-9]|1[0-9]|20))?d?")
-"""Format of an instant's number."""
 
 PAGE = re.compile(r"\d+")
 DATASET = re.compile(r"(?P<name>[\w./-]+)\[(?P<index>\d+)\]", re.ASCII)
@@ -43,26 +41,28 @@ def check_pattern(pattern: str, instants: Sequence[int]) -> None:
     ValueError
     """
     try:
-        fields = {name: (width, turn) for _, name, width, turn in string.Formatter().parse(pattern) if name is not None}
-        if set(fields) != FIELDS:
-            raise ValueError("each of them, and no others")
-        if fields["camera"] != ("", None) or fields["instant"][1] or not WIDTH.fullmatch(fields["instant"][0] or ""):
-            raise ValueError("no other format than {instant:06d}")
+        _check_fields(pattern)
         paths = [pattern.format(camera="camera", instant=instant) for instant in (instants[0], instants[-1])]
     except ValueError as error:
         raise ValueError(f"images: a path with {{camera}} and {{instant}} ({error})") from None
     path, part = _parts(paths[0])
     if Path(path).is_absolute() or ".." in Path(path).parts:
         raise ValueError("images: a path below the folder of the data set")
-    form = DATASET if path.endswith(HDF5) else PAGE if path.endswith(TIFF) else None
-    if form is None or (part is None) != ("#" not in pattern) or (part is None and form is DATASET):
+    in_tiff = path.endswith(TIFF) and (part is None or PAGE.fullmatch(part))
+    in_hdf5 = path.endswith(HDF5) and part is not None and DATASET.fullmatch(part)
+    if not in_tiff and not in_hdf5:
         raise ValueError("images: a path that ends in .tif, .tif#{instant} or .h5#NAME[{instant}]")
-    if part is None:
-        return
-    if not form.fullmatch(part):
-        raise ValueError("images: a path that ends in .tif, .tif#{instant} or .h5#NAME[{instant}]")
-    if instants[0] != 0 and path == _parts(paths[1])[0]:
+    if part is not None and instants[0] != 0 and path == _parts(paths[1])[0]:
         raise ValueError("images: first = 0 with a stack, whose images count from 0")
+
+
+def _check_fields(pattern: str) -> None:
+    fields = {name: (width, turn) for _, name, width, turn in string.Formatter().parse(pattern) if name is not None}
+    if set(fields) != FIELDS:
+        raise ValueError("each of them, and no others")
+    width, turn = fields["instant"]
+    if fields["camera"] != ("", None) or turn or not NUMBER_FORMAT.fullmatch(width or ""):
+        raise ValueError("no other format than {instant:06d}")
 
 
 def _parts(path: str) -> tuple[str, str | None]:

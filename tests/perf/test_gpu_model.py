@@ -91,7 +91,7 @@ def test_no_projection_touches_much_more_than_it_needs(projector):
             assert one.seconds > LAUNCH_S
 
 
-@pytest.mark.slow(but="pixels")
+@pytest.mark.slow
 def test_an_epoch_takes_every_subset_and_an_iteration_every_camera(projector):
     with loops_for_a_gpu():
         passes = Passes(Projector(projector.blocks), GRID.shape, cameras=2)

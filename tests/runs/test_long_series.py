@@ -7,7 +7,7 @@ from operator import length_hint
 import pytest
 from support.small_run import PAIRS, write_empty_report
 
-from lfpiv.runs import pipeline, summary, work_units
+from lfpiv.runs import pipeline, summary, usable_images, work_units
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.runs.pending_pairs import PendingPairs
@@ -58,12 +58,12 @@ def test_of_finished_files_no_more_are_verified_ahead_than_until_one_does_not_fi
     assert list(todo) == [300, 301]
 
 
-def test_pairs_of_a_series_come_along_its_chains():
+def test_pairs_of_a_series_come_step_by_step():
     todo, _ = make_todo([0] * 7, step=3)
     assert list(todo) == [0, 3, 6, 1, 4, 2, 5]
 
 
-def test_stretches_are_cut_as_they_are_needed():
+def test_work_units_are_cut_as_they_are_needed():
     taken = []
     source = (taken.append(pair) or pair for pair in range(MANY))
     first = next(work_units.cut(source, 1, 2))
@@ -146,7 +146,7 @@ def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path
         monkeypatch.setattr(type(run), "has_volumes", lambda self, pair: False)
         tracemalloc.start()
         todo = run.unfinished()
-        assert run.check_images(todo) is None and run.need_weights(todo) and next(todo) == 0
+        assert usable_images.check_images(run, todo) is None and run.need_weights(todo) and next(todo) == 0
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert 0 < len(asked) <= 100 and length_hint(todo) == MANY - 1 and peak < BYTES_PER_PAIR * MANY

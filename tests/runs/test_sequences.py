@@ -91,7 +91,7 @@ def volumes(folder):
 
 @hypothesis.settings(deadline=None)
 @given(st.sets(st.integers(0, 200), min_size=1), st.integers(1, 90))
-def test_stretches_are_segments_and_cover_each_pair_once(chosen, step):
+def test_work_units_are_segments_and_cover_each_pair_once(chosen, step):
     todo = sorted(chosen)
     units = list(cut_at_segments(todo, step))
     boundary_pairs = Counter(pair for unit in units for pair in unit.boundary_pairs)

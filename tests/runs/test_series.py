@@ -78,7 +78,7 @@ TODO = st.tuples(st.integers(0, 50), st.sets(st.integers(0, 120), min_size=1), s
 
 @hypothesis.settings(deadline=None)
 @given(TODO)
-def test_stretches_cover_each_pair_once_and_share_no_instant(case):
+def test_work_units_cover_each_pair_once_and_share_no_instant(case):
     first, chosen, step, workers = case
     todo = sorted(first + pair for pair in chosen)
     units = list(cut(chained(todo, step), step, workers))
@@ -143,7 +143,7 @@ def test_vectors_are_those_of_the_same_images_as_pairs(small_run, reference):
 
 
 @pytest.mark.slow
-def test_a_stretch_whose_worker_dies_goes_on_after_its_finished_pairs(made, reference, tmp_path, solved):
+def test_a_work_unit_whose_worker_dies_goes_on_after_its_finished_pairs(made, reference, tmp_path, solved):
     work = changed(made[1], tmp_path / "out", scratch=tmp_path / "scratch")
     plain = list(cut(list(work.experiment.numbers), 1, 1))
     longest = max(plain, key=lambda unit: len(unit.pairs))
@@ -156,7 +156,7 @@ def test_a_stretch_whose_worker_dies_goes_on_after_its_finished_pairs(made, refe
 
 
 @pytest.mark.slow
-def test_a_stretch_that_kills_two_workers_has_failed_but_for_its_finished_pairs(small_run, made, tmp_path):
+def test_a_work_unit_that_kills_two_workers_has_failed_but_for_its_finished_pairs(small_run, made, tmp_path):
     work = changed(made[1], tmp_path / "out", scratch=tmp_path / "scratch")
     outcomes, client = in_processes(work, 1, {FIRST: [1, 1]})
     died = client.submitted[0].pairs
