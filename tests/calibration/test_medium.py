@@ -8,26 +8,19 @@ import numpy as np
 import pytest
 from support import scenes
 from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
+from support.ideal_rig import optics
 
 import lfpiv
 from lfpiv.calibration import checks
 from lfpiv.calibration.liquid import liquid_surface
 from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
-from lfpiv.geometry.optics import Optics, random_on_pupil
+from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.simulation.scene import true_mapping
 from lfpiv.simulation.scene_camera import SceneCamera
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import Code, collected
 
-OPTICS = Optics(
-    focal_length_mm=100.0,
-    magnification=-1.0,
-    f_number=4.0,
-    microlens_pitch_mm=0.1,
-    microlens_focal_length_mm=0.8,
-    pixel_mm=0.0055,
-    sensor_shape=(1000, 1200),
-)
+OPTICS = optics(1000, 1200)
 LABEL_MM = 0.0005
 INDEX = 0.03  # the liquid's index, from depth and defocus with prior knowledge of the optics
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.ideal_rig import optics
 
 from lfpiv.calibration import levenberg_marquardt as trainers
 from lfpiv.calibration.levenberg_marquardt import (
@@ -20,7 +21,6 @@ from lfpiv.calibration.network import Network, sigma_nor
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
 from lfpiv.calibration.training import TrainingSettings, split_samples, train
 from lfpiv.calibration.virtual_samples import VirtualSamples, between_dots
-from lfpiv.geometry.optics import Optics
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
 
 EXACT = 1e-10  # relative, float64 sums of some hundred terms
@@ -28,15 +28,7 @@ DIFFERENCE = 1e-6  # relative, central difference of exact first derivatives
 SINGLE = 1e-6  # the kernel in float32: a few roundings of 6e-8 of the range in each of at most three layers
 PITCH = 0.1  # [mm]
 
-OPTICS = Optics(
-    focal_length_mm=100.0,
-    magnification=-1.0,
-    f_number=4.0,
-    microlens_pitch_mm=PITCH,
-    microlens_focal_length_mm=0.8,
-    pixel_mm=0.0055,
-    sensor_shape=(1280, 1600),
-)
+OPTICS = optics(1280, 1600)
 
 
 def random_network(sizes, rng):

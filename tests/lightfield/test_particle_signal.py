@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from support import scenes
 
 import lfpiv
 from lfpiv.lightfield.image_checks import signal_warnings
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE, seen_structure, structure
-from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import gather
 
@@ -17,36 +17,19 @@ BACKGROUND, READ_NOISE = 40.0, 3.0  # counts, as simulated
 
 
 def scene(layout, count, sigma_mm, brightness):
-    camera = {
-        "name": "only",
-        "focal_length_mm": 100.0,
-        "magnification": -1.0,
-        "f_number": 4.0,
-        "microlens_pitch_mm": 0.1,
-        "microlens_focal_length_mm": 0.8,
-        "pixel_um": 6.5,
-        "microlens_layout": layout,
-        "sensor_width_px": 420,
-        "sensor_height_px": 400,
-        "nominal_angle_deg": 35.0,
-        "true_array_roll_deg": 0.4,
-        "lens_gain_sd": 0.02,
-        "vignetting": 0.2,
-    }
-    particles = {"count": count} | ({} if sigma_mm is None else {"sigma_mm": sigma_mm})
-    return Scene.model_validate(
-        {
-            "name": "structure",
-            "seed": count,
-            "dt_s": 1e-3,
-            "camera": (camera,),
-            "board": {"dots": (3, 3), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": (-0.5, 0.5)},
-            "volume": {"size_mm": (2.0, 2.0, 1.4), "voxel_mm": 0.1},
-            "particles": particles,
-            "flow": {"kind": "uniform", "displacement_mm": (0.05, 0.0, 0.0)},
-            "exposure": {"particle_counts": brightness},
-            "noise": {"background": BACKGROUND, "read_noise": READ_NOISE},
-        }
+    imperfect = {"true_array_roll_deg": 0.4, "lens_gain_sd": 0.02, "vignetting": 0.2}
+    camera = scenes.camera("only", 35.0, (420, 400), pixel_um=6.5, microlens_layout=layout, **imperfect)
+    return scenes.scene(
+        "structure",
+        [camera],
+        planes_mm=(),
+        size_mm=(2.0, 2.0, 1.4),
+        particles={"count": count} | ({} if sigma_mm is None else {"sigma_mm": sigma_mm}),
+        displacement_mm=(0.05, 0.0, 0.0),
+        seed=count,
+        board={"dots": (3, 3), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": (-0.5, 0.5)},
+        exposure={"particle_counts": brightness},
+        noise={"background": BACKGROUND, "read_noise": READ_NOISE},
     )
 
 

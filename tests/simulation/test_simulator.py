@@ -148,38 +148,6 @@ def test_board_equals_its_twin(device, rig):
     assert np.abs(found + inverse - white).max() <= EDGE_SAMPLES / samples
 
 
-@pytest.mark.parametrize(("rig", "tilt_error"), [("ideal", 0.002), ("misaligned", 0.02), ("hexagonal", 0.02)])
-def test_dots_traced_forward_and_backward_agree(device, rig, tilt_error):
-    """Two independent kernels, one radiometry: light of a dot = level x microimage x lenses its image covers.
-
-    Forward rays leave a dot evenly towards the pupil; a radiant tilted board favours one side of the pupil by some
-    per cent, which is the error allowed where the board is tilted.
-    """
-    scene_camera = camera(rig, vignetting=0, lens_gain_sd=0)
-    renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
-    rays = render.ray_table(1 << 17, "disc", 0)
-    m = renderer.image_distance_mm / (
-        renderer.object_distance_mm - ((dots - renderer.offset_mm) @ renderer.rotation.T)[:, 2]
-    )
-    lenses = np.pi * 0.05**2 * abs(renderer.rotation[2, 2]) * m**2 / abs(np.linalg.det(renderer.basis_mm))
-    forward = render.render_sources(
-        renderer, dots, lenses * renderer.microimage_px, 0.05, rays, rng=np.random.default_rng(0)
-    )
-    backward = collect.render_board(
-        renderer,
-        0.1,
-        dots=(2, 1),
-        spacing_mm=0.2,
-        dot_diameter_mm=0.1,
-        dot_light=1,
-        board_light=0,
-        samples=1024,
-        seed=0,
-    )
-    assert forward.sum() == pytest.approx(backward.sum(), rel=tilt_error)
-    assert np.linalg.norm(forward - backward) < (tilt_error + 0.02) * np.linalg.norm(backward)  # 2 %: noise of the rays
-
-
 @pytest.mark.slow
 def test_images_add_exactly_and_do_not_depend_on_threads(device, tmp_path):
     renderer, rays = render_camera(camera(), seed=4), render.ray_table(4096, "ball", 0)

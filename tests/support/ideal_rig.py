@@ -16,14 +16,14 @@ def rotation(yaw_deg, pitch_deg=0.0, roll_deg=0.0):
     return np.array(about_z) @ about_x @ about_y
 
 
-def optics(rows=400, columns=480, layout="square"):
+def optics(rows=400, columns=480, layout="square", pixel_mm=0.0055):
     return Optics(
         focal_length_mm=100.0,
         magnification=-1.0,
         f_number=4.0,
         microlens_pitch_mm=0.1,
         microlens_focal_length_mm=0.8,
-        pixel_mm=0.0055,
+        pixel_mm=pixel_mm,
         sensor_shape=(rows, columns),
         layout=layout,
     )

@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+from support import scenes
 
 from lfpiv.simulation.scene import Scene, SceneCamera
 
@@ -14,18 +15,7 @@ else:
 ROUNDING = 1e-12  # float64, a few operations on millimetres
 MONTE_CARLO = 5.0  # standard errors; 1e-6 chance per comparison
 
-TABLE_2 = {
-    "name": "cam",
-    "focal_length_mm": 100,
-    "magnification": -1,
-    "f_number": 4,
-    "microlens_pitch_mm": 0.1,
-    "microlens_focal_length_mm": 0.8,
-    "pixel_um": 5.5,
-    "sensor_width_px": 150,
-    "sensor_height_px": 110,
-    "nominal_angle_deg": 45,
-}
+TABLE_2 = scenes.camera("cam", 45, (150, 110), pixel_um=5.5)
 RIGS = {
     "ideal": {"nominal_angle_deg": 0},
     "misaligned": {

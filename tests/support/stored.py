@@ -2,13 +2,14 @@
 
 import h5py
 import numpy as np
+from support import ideal_rig
 
 from lfpiv import hdf5
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import thin_lens_model
-from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.optics import LensLattice
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.standing_light import StandingLight
 from lfpiv.warn import Code, Warning
@@ -25,15 +26,7 @@ def rewrite(path, change, *, sealed=False):
 def small_calibration():
     """Return a calibration of two cameras with everything that its file holds: valid in form, not in physics."""
     rng, cameras = np.random.default_rng(0), {}
-    optics = Optics(
-        focal_length_mm=100.0,
-        magnification=-1.0,
-        f_number=4.0,
-        microlens_pitch_mm=0.1,
-        microlens_focal_length_mm=0.8,
-        pixel_mm=0.01,
-        sensor_shape=(48, 64),
-    )
+    optics = ideal_rig.optics(48, 64, pixel_mm=0.01)
     lattice = LensLattice(origin_mm=(0.03, -0.02), basis_mm=((0.1, 0.0), (0.0, 0.1)))
     for name in ("left", "right"):
         network = Network(

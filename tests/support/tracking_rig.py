@@ -1,10 +1,9 @@
 """A small rig of ideal cameras, and images of particles in it that rays of the simulator render."""
 
 import numpy as np
-from support.ideal_rig import IdealCamera, IdealRig, lattice, rotation
+from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 
 from lfpiv.geometry.grid import Grid
-from lfpiv.geometry.optics import Optics
 from lfpiv.weights.operator import build_weights
 from lfpiv_kernels.rendering import render
 
@@ -21,18 +20,9 @@ class TrackingRig:
     """Cameras about a volume of 12 x 16 x 16 voxels and a voxel more at each face."""
 
     def __init__(self, angles=(45.0, -45.0), layout="square"):
-        optics = Optics(
-            focal_length_mm=100.0,
-            magnification=-1.0,
-            f_number=4.0,
-            microlens_pitch_mm=0.1,
-            microlens_focal_length_mm=0.8,
-            pixel_mm=0.011,
-            sensor_shape=(220, 260),
-            layout=layout,
-        )
+        seen = optics(220, 260, layout, pixel_mm=0.011)
         self.cameras = {
-            f"cam{number}": IdealCamera(f"cam{number}", rotation(angle, 0.2), optics, lattice(layout, 0.1 * number))
+            f"cam{number}": IdealCamera(f"cam{number}", rotation(angle, 0.2), seen, lattice(layout, 0.1 * number))
             for number, angle in enumerate(angles)
         }
         self.grid = Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.6, 1.6, 1.2), voxel_mm=VOXEL_MM)
