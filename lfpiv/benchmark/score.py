@@ -161,7 +161,7 @@ def score_fields(
     found = metrics.block_bootstrap(sample.statistics, sample.block, resamples=options.resamples)
     found["completeness"] = _mean_of([one.completeness for one in pairs])
     found["divergence"] = _mean_of([divergence(one, truth) for one in pairs if one.scored.any()])
-    found |= {key: _exact(value) for key, value in (in_time(pairs) | _costs(fields)).items()}
+    found |= {key: _exact(value) for key, value in {**in_time(pairs), **_costs(fields)}.items()}
     if first.is_particles:
         found |= _particle_figures(truth, by_number, numbers)
     if options.volumes is not None:

@@ -29,6 +29,7 @@ from reconstruction_cases import (
     ANGLES_DEG,
     CONDITIONS,
     FLOWS,
+    SIZE_MM,
     Case,
     make_rig,
     record,
@@ -39,9 +40,9 @@ from reconstruction_ways import WAYS, Way, table_of
 
 import lfpiv
 from lfpiv import metrics
+from lfpiv.joint.vectors import joint_vectors
 from lfpiv.reproduce import rigs, store
 from lfpiv.settings.processing import Correlation
-from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.settings import cut_windows
 
 CACHE = Path(tempfile.gettempdir()) / "lfpiv-reconstruction-bench"
@@ -93,12 +94,12 @@ def measure(case: Case, way: Way, folder: Path) -> dict[str, float]:
 
 
 def vectors_of(case: Case, volumes: Sequence[xr.DataArray], settings: Mapping[str, Any]) -> list[xr.Dataset]:
-    """Correlate each volume with the next one."""
+    """Correlate each volume with the next one; a joint fit has a displacement already."""
     keys = ({"windows": case.windows} if case.windows else {}) | table_of(settings, "correlation")
     options = Correlation(**keys).model_dump()
     if options["windows"] is not None:
         options["windows"] = cut_windows(options["windows"], volumes[0].shape)
-    return [correlate(first, second, dt_s=rigs.DT_S, **options) for first, second in pairwise(volumes)]
+    return [joint_vectors(pair, dt_s=rigs.DT_S, **options) for pair in pairwise(volumes)]
 
 
 def field_figures(case: Case, vectors: xr.Dataset) -> dict[str, float]:
@@ -288,7 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ppm", default="0.5", help="particles per microlens")
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--frames", type=int, default=2, help="frames of a series")
-    parser.add_argument("--scale", choices=("small", "paper"), default="small")
+    parser.add_argument("--scale", choices=tuple(SIZE_MM), default="small")
     parser.add_argument("--set", nargs="+", action="append", default=[], metavar="WAY", help="NAME and KEY=VALUE")
     parser.add_argument("--against", nargs="*", metavar="WAY", help="the reference, default: the code's defaults")
     parser.add_argument("--cache", type=Path, default=CACHE, help="folder of images and figures")

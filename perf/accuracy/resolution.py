@@ -15,14 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from joint_fit import case_of, fitted
-from reconstruction_cases import make_flow, true_volume
+from reconstruction_bench import CACHE, vectors_of
+from reconstruction_cases import ANGLES_DEG, Case, make_flow, make_rig, record, true_volume
+from reconstruction_ways import WAYS as RECONSTRUCTED
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.joint.pair import MOVED
-from lfpiv.settings.processing import Correlation
-from lfpiv.velocity.cross_correlation import correlate
-from lfpiv.velocity.settings import cut_windows
 
 WAYS = ("correlation", "true particles", "joint vectors", "joint field")
 FACE_MM = 0.6
@@ -50,18 +48,17 @@ def of_vectors(case, vectors: xr.Dataset) -> np.ndarray:
     return response(case, [vectors[axis].values for axis in AXES], found, float(vectors.attrs["voxel_mm"][0]))
 
 
-def responses(name: str) -> np.ndarray:
+def responses(case: Case) -> np.ndarray:
     """Return the responses along y and z of one case: correlation, true volumes, joint vectors, joint field."""
-    case = case_of(name)
-    alone, joint = fitted(case, "correlation"), fitted(case, "joint")
-    windows = cut_windows(case.windows, alone.volumes[0].shape)
-    true = [true_volume(case, alone.recorded, frame) for frame in (0, 1)]
-    ideal = correlate(*true, **Correlation().model_dump() | {"windows": windows})
-    first = joint.volumes[0]
+    rig, recorded = make_rig(case.scale, case.angles_deg), record(case, CACHE / "images")
+    alone, joint = (RECONSTRUCTED[way].reconstruct(rig, recorded, {}).volumes for way in ("ours", "joint"))
+    true = [true_volume(case, recorded, frame) for frame in (0, 1)]
+    correlated, ideal, fitted = (vectors_of(case, volumes, {})[0] for volumes in (alone, true, joint))
+    first = joint[0]
     moved = np.stack([first[MOVED[axis]].values for axis in "xyz"], -1)
     axes = [first[axis].values for axis in AXES]
     field = response(case, axes, moved, float(axes[2][1] - axes[2][0]))
-    return np.stack([of_vectors(case, alone.vectors), of_vectors(case, ideal), of_vectors(case, joint.vectors), field])
+    return np.stack([*(of_vectors(case, one) for one in (correlated, ideal, fitted)), field])
 
 
 if __name__ == "__main__":
@@ -73,7 +70,8 @@ if __name__ == "__main__":
     arguments, rows = parser.parse_args(), []
     print(f"| wave [voxel] | {' | '.join(f'{way} y, z' for way in WAYS)} |\n|---|---|---|---|---|")
     for wave in arguments.waves:
-        found = np.array([responses(f"wave{wave}:{arguments.ppm}:{seed}:2") for seed in arguments.seeds])
+        of_all = {"flow": f"wave{wave}", "ppm": arguments.ppm, "angles_deg": ANGLES_DEG[2], "scale": "flat"}
+        found = np.array([responses(Case(seed=seed, **of_all)) for seed in arguments.seeds])
         mean, error = found.mean(0), found.std(0, ddof=1) / len(found) ** 0.5
         cells = [
             " ".join(f"{m:.2f} ± {e:.2f}" for m, e in zip(*row, strict=True)) for row in zip(mean, error, strict=True)

@@ -140,7 +140,7 @@ def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path
     tiny_experiment.write_text(text.replace("pairs = 2", f"pairs = {MANY}"))
     asked = []
     monkeypatch.setattr("lfpiv.runs.usable_images.recorded.missing", lambda experiment: None)
-    monkeypatch.setattr("lfpiv.runs.usable_images.check_pairs", lambda experiment, pairs: asked.extend(pairs) or iter(()))
+    monkeypatch.setattr(usable_images, "check_pairs", lambda experiment, pairs: asked.extend(pairs) or iter(()))
     with open_run(tiny_experiment, tmp_path / "out", "cpu", None) as run:
         monkeypatch.setattr(type(run), "files", lambda self, pair: pytest.fail(f"pair {pair} is looked at"))
         monkeypatch.setattr(type(run), "has_volumes", lambda self, pair: False)
