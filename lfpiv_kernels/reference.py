@@ -11,16 +11,17 @@ from lfpiv_kernels.weights.microimages import LAYERS
 def position(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
     """Return (s, t) [mm] of a voxel's rays through pupil points, shape (..., 2); `model`: ``ray_model.MODEL_SIZE``."""
     u, v = pupil[..., 0], pupil[..., 1]
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    return np.stack([terms @ model[:6], terms @ model[6:12]], axis=-1)
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=-1)
+    return np.stack([terms @ np.append(model[:6], model[30:34]), terms @ np.append(model[6:12], model[34:])], axis=-1)
 
 
 def slope(model: np.ndarray, pupil: np.ndarray) -> np.ndarray:
     """Return K = d(s, t)/d(u, v) at one pupil point, shape (2, 2)."""
     u, v = pupil
-    return np.array(
-        [[c[1] + 2 * c[3] * u + c[4] * v, c[2] + c[4] * u + 2 * c[5] * v] for c in (model[:6], model[6:12])]
-    )
+    along_u = np.array([0, 1, 0, 2 * u, v, 0, 3 * u * u, 2 * u * v, v * v, 0])
+    along_v = np.array([0, 0, 1, 0, u, 2 * v, 0, u * u, 2 * u * v, 3 * v * v])
+    both = np.append(model[:6], model[30:34]), np.append(model[6:12], model[34:])
+    return np.array([[along_u @ c, along_v @ c] for c in both])
 
 
 def smeared_step(x, widths):
@@ -45,7 +46,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
 
     Parameters
     ----------
-    model : ndarray, shape (30,)
+    model : ndarray, shape (38,)
         Ray model.
     optics, lattice
         Values with the attributes of ``lfpiv.geometry.optics.Optics`` and ``LensLattice``.
@@ -158,11 +159,10 @@ def counted(model, first_voxel, points, bits, *, optics, lattice):
         angle = np.pi / 4 * np.where(wide, b, a) / radius
         u, v = radius * np.cos(angle), radius * np.sin(angle)
         u, v = optics.pupil_radius_mm * np.where(wide, u, v), optics.pupil_radius_mm * np.where(wide, v, u)
-        terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3])
-        st = own[:20].reshape(2, 10) @ terms
+        st = position(own, np.stack([u, v], axis=1)).T
         for axis in range(3):
-            edge = own[20 + 2 * axis : 22 + 2 * axis, None]
-            slope = own[26 + 4 * axis : 30 + 4 * axis].reshape(2, 2)
+            edge = own[12 + 2 * axis : 14 + 2 * axis, None]
+            slope = own[18 + 4 * axis : 22 + 4 * axis].reshape(2, 2)
             st = st + (at[axis] - 0.5) * (edge + slope @ np.stack([u, v]))
         st = st.T
         centre = lattice.centres_mm(lattice.nearest(st))

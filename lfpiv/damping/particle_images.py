@@ -66,7 +66,7 @@ class ParticleImager:
             image = np.zeros(camera.optics.sensor_shape, np.float32)
             part = np.empty(image.size, np.float32)
             for some in self._batches(len(positions_mm)):
-                models = _shifted(ray_models(camera, positions_mm[some], self._edge_mm), self._steps)
+                models = _shifted(ray_models(camera, positions_mm[some], self._edge_mm, self._forms[name]), self._steps)
                 cubes = Projector(blocks_of(packed, [models], self._forms[name]))
                 values = (light[some, None] * self._light).astype(np.float32).ravel()
                 image += cubes.project(values, part).reshape(image.shape)
@@ -81,15 +81,15 @@ class ParticleImager:
 
 
 def _shifted(models: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return the ray models of cubes `steps` (cube, 3) edges away from each model's, shape (model * cube, 30).
+    """Return the ray models of cubes `steps` (cube, 3) edges away from each model's, shape (model * cube, 38).
 
     A model holds the differences of the mapping between opposite faces of its cube, which is one edge wide.
     """
-    every = np.repeat(models, len(steps), axis=0).reshape(len(models), len(steps), 30)
+    every = np.repeat(models, len(steps), axis=0).reshape(len(models), len(steps), -1)
     fits = every[..., :12].reshape(*every.shape[:2], 2, 6)
     points = models[:, 12:18].reshape(-1, 3, 2)  # axis of the world, axis of the lens array
-    slopes = models[:, 18:].reshape(-1, 3, 2, 2)
+    slopes = models[:, 18:30].reshape(-1, 3, 2, 2)
     fits[..., 0] += np.einsum("ca,mas->mcs", steps, points)
     fits[..., 1:3] += np.einsum("ca,masp->mcsp", steps, slopes)
     every[..., :12] = fits.reshape(*every.shape[:2], 12)
-    return np.ascontiguousarray(every.reshape(-1, 30), np.float32)
+    return np.ascontiguousarray(every.reshape(-1, models.shape[1]), np.float32)

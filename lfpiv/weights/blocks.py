@@ -134,7 +134,7 @@ class Places(Protocol):
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Return the cubes' centres (x, y, z) [mm] by their index, shape (cube, 3)."""
 
-    def models(self, camera: CalibratedCamera) -> Iterator[np.ndarray]:
+    def models(self, camera: CalibratedCamera, form: str = "pixels") -> Iterator[np.ndarray]:
         """Yield the ray models, plane by plane of the outermost axis."""
 
 
@@ -160,7 +160,7 @@ def footprint_blocks(
     blocks, values = sample_blocks(packed, places, form, cuts)
     require_numbers(size * blocks, places.volume_shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))
-    planes = places.models(camera)
+    planes = places.models(camera, form)
 
     def batches() -> Iterator[np.ndarray]:
         step = max(1, CHUNK_VOXELS * shape[0] // size)
@@ -185,7 +185,7 @@ def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
 def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
     """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels, or of nodes."""
     sample = np.unique(np.linspace(0, places.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    model = ray_models(packed.calibrated, places.centres_mm(sample), places.voxel_mm)
+    model = ray_models(packed.calibrated, places.centres_mm(sample), places.voxel_mm, form)
     blocks, values = (
         np.concatenate(counts) for counts in zip(*packed.footprints(form, cuts).compute(model), strict=True)
     )
@@ -206,7 +206,7 @@ def blocks_of(
     ----------
     packed : PackedCamera
         The camera.
-    models : iterable of ndarray, shape (voxel, 30), float32
+    models : iterable of ndarray, shape (voxel, 38), float32
         Ray models, one batch after the other.
     form : {"profiles", "pixels"}
         Form of the blocks.

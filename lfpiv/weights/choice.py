@@ -18,9 +18,8 @@ import numpy as np
 from lfpiv.warn import Code, Warning, warn
 from lfpiv.weights.blocks import WHOLE, Cuts, PackedCamera, blocks_of
 from lfpiv.weights.counting import CountedVoxels, draw_seen
-from lfpiv.weights.ray_fit import fit_rays, ray_models
+from lfpiv.weights.ray_fit import bent_pitch, ray_models
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels.rays.count import POWERS
 from lfpiv_kernels.reconstruction.projector import Blocks
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ CUTS: tuple[Cuts, ...] = (
 CUT_ERROR = 0.0125
 """Largest mean relative L2 difference from the finest cut with which a coarser cut is chosen."""
 BENT, WIDE = 0.01, 2.0
-"""Departure of rays from second order, and projected voxel edge, above which they are named as the cause of an error
+"""Departure of rays from third order, and projected voxel edge, above which they are named as the cause of an error
 [microlens pitch]."""
 
 
@@ -111,7 +110,7 @@ def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[f
     """Return the errors of footprints in a form, one per counted voxel. Only these voxels are integrated."""
     if not len(counted.voxels):
         return []
-    model = ray_models(counted.camera, counted.centres_mm, counted.stored.grid.voxel_mm)
+    model = ray_models(counted.camera, counted.centres_mm, counted.stored.grid.voxel_mm, form)
     blocks = blocks_of(PackedCamera.of(counted.camera), [model], form, cuts=cuts)
     return counted.errors(blocks, range(len(model)))
 
@@ -162,11 +161,11 @@ def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *
     if not errors:
         warn(log, Warning(code=Code.WEIGHTS_UNCHECKED, subject=camera.name))
     elif np.mean(errors) > AIM_MEAN or max(errors) > AIM_WORST:
-        bent, wide = _bent(camera, counted.centres_mm), _wide(camera, counted)
+        bent, wide = bent_pitch(camera, counted.centres_mm, 3), _wide(camera, counted)
         if form == "profiles" and requested:
             cause = "profiles suit straight rays and upright arrays; set compute.weights_form to 'auto'"
         elif bent > BENT:
-            cause = "aberrations beyond the second order in the pupil point; weights follow rays up to that order"
+            cause = "aberrations beyond the third order in the pupil point; weights follow rays up to that order"
         elif wide > WIDE:
             cause = "voxels larger than microlenses; lower volume.voxel_mm"
         else:
@@ -174,16 +173,6 @@ def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *
         figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
         figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
         warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=camera.name, figures=figures))
-
-
-def _bent(camera: CalibratedCamera, centres_mm: np.ndarray) -> float:
-    """Return the largest departure of rays from a polynomial of second order in the pupil point [microlens pitch]."""
-    third, second = (fit_rays(camera, centres_mm, degree=degree) for degree in (3, 2))
-    third[..., : second.shape[-1]] -= second
-    angle = np.arange(0, 2 * np.pi, np.pi / 8)
-    u, v = camera.optics.pupil_radius_mm * np.array([np.cos(angle), np.sin(angle)])
-    rays = third @ np.stack([u**a * v**b for a, b in POWERS])
-    return float(np.hypot(rays[:, 0], rays[:, 1]).max() / camera.lattice.pitch_mm)
 
 
 def _wide(camera: CalibratedCamera, counted: CountedVoxels) -> float:

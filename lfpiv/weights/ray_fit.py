@@ -14,6 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from lfpiv_kernels.rays.count import POWERS
+from lfpiv_kernels.weights.ray_model import MODEL_SIZE
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -26,6 +27,8 @@ STEPS = (8, 4, 2, 1)
 """Distances between fits on a grid that are tried, widest first [voxel]."""
 PROBES = 256
 """Number of random voxels in which interpolated fits are compared with direct ones."""
+BENT_PITCH = 0.01
+"""Departure of rays from second order in the pupil point above which third order follows them [microlens pitch]."""
 NEAR_PITCH = 3e-4
 """Largest difference between interpolated and direct rays [microlens pitch]."""
 
@@ -68,27 +71,55 @@ def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) ->
     return out
 
 
-def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, degree: int = 2) -> np.ndarray:
+def degree_of(camera: CalibratedCamera, points_mm: np.ndarray, form: str) -> int:
+    """Return the degree of polynomials of the pupil point that weights in a form need: 2 or 3.
+
+    Profiles take rays as straight over what a lens sees. The best straight ones follow from the second order.
+    """
+    if form == "profiles":
+        return 2
+    return 3 if form == "count" or bent_pitch(camera, points_mm, 2) > BENT_PITCH else 2
+
+
+def bent_pitch(camera: CalibratedCamera, points_mm: np.ndarray, degree: int) -> float:
+    """Return the largest departure of rays at the pupil's edge from polynomials of a degree [microlens pitch]."""
+    angle = np.arange(0, 2 * np.pi, np.pi / 8)
+    u, v = camera.optics.pupil_radius_mm * np.array([np.cos(angle), np.sin(angle)])
+    rays = camera.map_fan(points_mm, np.stack([u, v], axis=1).astype(np.float32))
+    terms = np.stack([u**a * v**b for a, b in POWERS if a + b <= degree])
+    off = rays - (fit_rays(camera, points_mm, degree=degree) @ terms).swapaxes(1, 2)
+    return float(np.nan_to_num(np.hypot(off[..., 0], off[..., 1])).max(initial=0.0) / camera.lattice.pitch_mm)
+
+
+def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, form: str = "pixels") -> np.ndarray:
     """Return ray models of single voxels, see `grid_models`.
 
-    The projected edges are differences of the mapping between opposite faces of the voxel.
+    The projected edges are differences of the mapping between opposite faces of the voxel. `form` is that of the
+    weights, or "count" for third order.
 
     Returns
     -------
-    ndarray, shape (voxel, 30 or 38), float32
+    ndarray, shape (voxel, 38), float32
     """
+    degree = degree_of(camera, centres_mm, form)
     fits = fit_rays(camera, centres_mm, degree=degree)
-    terms = fits.shape[1] * fits.shape[2]
-    model = np.empty((len(centres_mm), terms + 18), np.float32)
-    model[:, :terms] = fits.reshape(-1, terms)
+    model = np.zeros((len(centres_mm), MODEL_SIZE), np.float32)
+    _set_rays(model, fits)
     for axis in range(3):
         face = np.zeros(3)
         face[axis] = voxel_mm / 2
         before, behind = (fit_rays(camera, centres_mm + sign * face, degree=degree) for sign in (-1, 1))
         edge = behind - before
-        model[:, terms + 2 * axis : terms + 2 + 2 * axis] = edge[:, :, 0]
-        model[:, terms + 6 + 4 * axis : terms + 10 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
+        model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
+        model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
     return _finite(model)
+
+
+def _set_rays(model: np.ndarray, fits: np.ndarray) -> None:
+    """Write coefficients (..., 2, 6 or 10) into ray models (..., 38) of zeros."""
+    model[..., :12] = fits[..., :6].reshape(*fits.shape[:-2], 12)
+    if fits.shape[-1] > 6:
+        model[..., 30:] = fits[..., 6:].reshape(*fits.shape[:-2], 8)
 
 
 def grid_models(
@@ -96,7 +127,7 @@ def grid_models(
     shape: tuple[int, int, int],
     centres_mm: Callable[[np.ndarray], np.ndarray],
     axes: tuple[int, int, int],
-    degree: int = 2,
+    form: str = "pixels",
 ) -> Iterator[np.ndarray]:
     """Yield ray models of a grid's voxels, plane by plane of its outermost axis.
 
@@ -115,17 +146,16 @@ def grid_models(
         Returns (x, y, z) [mm].
     axes : tuple of int
         World axis (x, y, z: 0, 1, 2) of each axis of the grid.
-    degree : {2, 3}
-        Degree of the polynomials in the pupil point.
+    form : {"profiles", "pixels", "count"}, optional
+        Form of the weights, which decides the degree of the polynomials in the pupil point; "count" takes third order.
 
     Yields
     ------
-    ndarray, shape (voxels of a plane, 30 or 38), float32
-        See ``lfpiv_kernels.weights.ray_model.MODEL_SIZE`` and, for degree 3,
-        ``lfpiv_kernels.rays.counted_blocks.MODEL_SIZE``.
+    ndarray, shape (voxels of a plane, 38), float32
+        See ``lfpiv_kernels.weights.ray_model.MODEL_SIZE``.
     """
     outer, rows, columns = shape
-    fits, along = _interpolated(camera, shape, centres_mm, degree)
+    fits, along = _interpolated(camera, shape, centres_mm, form)
     terms = fits.shape[-1]
 
     def plane_fits(plane: int) -> np.ndarray:
@@ -137,15 +167,15 @@ def grid_models(
     before, here = plane_fits(-1), plane_fits(0)
     for plane in range(outer):
         after = plane_fits(plane + 1)
-        model = np.empty((rows, columns, terms + 18), np.float32)
-        model[..., :terms] = here[1:-1, 1:-1].reshape(rows, columns, terms)
+        model = np.zeros((rows, columns, MODEL_SIZE), np.float32)
+        _set_rays(model, here[1:-1, 1:-1])
         differences = (
             after[1:-1, 1:-1] - before[1:-1, 1:-1],
             here[2:, 1:-1] - here[:-2, 1:-1],
             here[1:-1, 2:] - here[1:-1, :-2],
         )
         for axis, difference in zip(axes, differences, strict=True):
-            edge, slope = terms + 2 * axis, terms + 6 + 4 * axis
+            edge, slope = 12 + 2 * axis, 18 + 4 * axis
             model[..., edge : edge + 2] = 0.5 * difference[..., 0]
             model[..., slope : slope + 4] = 0.5 * difference[..., 1:3].reshape(rows, columns, 4)
         yield model.reshape(rows * columns, -1)
@@ -153,7 +183,10 @@ def grid_models(
 
 
 def _interpolated(
-    camera: CalibratedCamera, shape: tuple[int, int, int], centres_mm: Callable[[np.ndarray], np.ndarray], degree: int
+    camera: CalibratedCamera,
+    shape: tuple[int, int, int],
+    centres_mm: Callable[[np.ndarray], np.ndarray],
+    form: str,
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Fit at the nodes of a coarser grid, shape (nodes, nodes, nodes, 12 or 20), and return the interpolation matrices.
 
@@ -162,6 +195,7 @@ def _interpolated(
     """
     rng = np.random.default_rng(0)
     probes = np.column_stack([rng.integers(0, n, PROBES) for n in shape])
+    degree = degree_of(camera, centres_mm(probes), form)
     scale = camera.optics.pupil_radius_mm ** np.array([sum(power) for power in POWERS if sum(power) <= degree])
     expected = _finite(fit_rays(camera, centres_mm(probes), degree=degree)) * scale
     for step in STEPS:

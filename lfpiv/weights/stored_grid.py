@@ -70,10 +70,10 @@ class StoredGrid:
         """Edge of a voxel [mm]."""
         return self.grid.voxel_mm
 
-    def models(self, camera: CalibratedCamera, degree: int = 2) -> Iterator[np.ndarray]:
+    def models(self, camera: CalibratedCamera, form: str = "pixels") -> Iterator[np.ndarray]:
         """Yield the ray models of the voxels, plane by plane of the outermost axis, see `grid_models`."""
         outer, middle, inner = (2 - axis for axis in self.order)
-        return grid_models(camera, self.shape, self.positions_mm, (outer, middle, inner), degree)
+        return grid_models(camera, self.shape, self.positions_mm, (outer, middle, inner), form)
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Return centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""

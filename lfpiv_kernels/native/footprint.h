@@ -328,25 +328,32 @@ struct LensTile {
 
     /// What the levels of a column of pixels share.
     struct Column {
-        V s, t, s_y, t_y;  // offset on the main lens and its slope along the rows
-        V n[4];            // matrix from that offset to rays in the lens's cell
+        V s, t, s_y, t_y, s_yy, t_yy;  // offset on the main lens, its slope and bend along the rows
+        V n[4], n_y[4];                // matrix from that offset to rays in the lens's cell, its change along the rows
     };
 
     /// Return what the levels of columns x from the reference pixel share.
     LFPIV_INLINE Column column_at(V x) const {
         const V *slope = values.slope, *matrix = values.matrix;
         Column at;
-        at.s = of(values.s) + x * (of(slope[0]) + x * bend.s_xx);
-        at.t = of(values.t) + x * (of(slope[2]) + x * bend.t_xx);
-        at.s_y = of(slope[1]) + x * bend.s_xy, at.t_y = of(slope[3]) + x * bend.t_xy;
-        for (int n = 0; n < 4; ++n) at.n[n] = of(matrix[n]) + x * bend.along_column[n];
+        const LocalBend<V>& local = values.bend;
+        at.s = of(values.s) + x * (of(slope[0]) + x * (of(local.s[0]) + x * bend.s3[0]));
+        at.t = of(values.t) + x * (of(slope[2]) + x * (of(local.t[0]) + x * bend.t3[0]));
+        at.s_y = of(slope[1]) + x * (of(local.s[1]) + x * bend.s3[1]);
+        at.t_y = of(slope[3]) + x * (of(local.t[1]) + x * bend.t3[1]);
+        at.s_yy = of(local.s[2]) + x * bend.s3[2], at.t_yy = of(local.t[2]) + x * bend.t3[2];
+        for (int n = 0; n < 4; ++n) {
+            at.n[n] = of(matrix[n]) + x * (of(local.along_column[n]) + x * bend.n_xx[n]);
+            at.n_y[n] = of(local.along_row[n]) + x * bend.n_xy[n];
+        }
         return at;
     }
     /// Return the levels of pixels of a column, y rows from the reference pixel.
     LFPIV_INLINE V level_in(const Column& at, V y) const {
-        const V ds = at.s + y * (at.s_y + y * bend.s_yy), dt = at.t + y * (at.t_y + y * bend.t_yy);
-        const V k0 = at.n[0] + y * bend.along_row[0], k1 = at.n[1] + y * bend.along_row[1];
-        const V k2 = at.n[2] + y * bend.along_row[2], k3 = at.n[3] + y * bend.along_row[3];
+        const V ds = at.s + y * (at.s_y + y * (at.s_yy + y * bend.s3[3]));
+        const V dt = at.t + y * (at.t_y + y * (at.t_yy + y * bend.t3[3]));
+        const V k0 = at.n[0] + y * (at.n_y[0] + y * bend.n_yy[0]), k1 = at.n[1] + y * (at.n_y[1] + y * bend.n_yy[1]);
+        const V k2 = at.n[2] + y * (at.n_y[2] + y * bend.n_yy[2]), k3 = at.n[3] + y * (at.n_y[3] + y * bend.n_yy[3]);
         const V inverse = 1.0f / (k0 * k3 - k1 * k2);
         const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
         const V level = abs(inverse) * inside_cell(a, b) * to_a + 0.5f;

@@ -2,7 +2,7 @@
 #ifndef LFPIV_GAUSSIAN_H
 #define LFPIV_GAUSSIAN_H
 
-#include "simd.h"
+#include "ray_model.h"
 
 namespace lfpiv {
 
@@ -68,8 +68,11 @@ struct Particle {
     /// Where rays through the pupil points (u, v) pass the lens's centre, along an axis of the cell [pitch].
     LFPIV_INLINE void pass(V u, V v, V& a, V& b) const {
         const float* m = model;
-        const V s = m[0] - centre_s + u * (m[1] + u * m[3] + v * m[4]) + v * (m[2] + v * m[5]);
-        const V t = m[6] - centre_t + u * (m[7] + u * m[9] + v * m[10]) + v * (m[8] + v * m[11]);
+        const float *p = m + 30, *q = m + 34;
+        const V s = m[0] - centre_s + u * (m[1] + u * (m[3] + u * p[0] + v * p[1]) + v * m[4]) +
+                    v * (m[2] + v * (m[5] + u * p[2] + v * p[3]));
+        const V t = m[6] - centre_t + u * (m[7] + u * (m[9] + u * q[0] + v * q[1]) + v * m[10]) +
+                    v * (m[8] + v * (m[11] + u * q[2] + v * q[3]));
         a = along(0, s, t);
         b = along(1, s, t);
     }
@@ -106,7 +109,8 @@ LFPIV_INLINE V load_shares(const float* from, int left) {
 template <class Inputs, class View>
 LFPIV_INLINE int write_lens(const Inputs& inputs, const View& view, int particle, int lens, int ray, float centre_s,
                             float centre_t, int* pixel_out, float* values_out) {
-    const Particle<Inputs, View> own{inputs, view, inputs.model.data + 30 * (int64_t)particle, centre_s, centre_t};
+    const Particle<Inputs, View> own{inputs, view, inputs.model.data + MODEL_SIZE * (int64_t)particle, centre_s,
+                                     centre_t};
     const int edge = inputs.edge, rays = edge * edge;
     const float cell = inputs.pixel_mm / inputs.ratio, grown = (1.0f + inputs.ratio) / inputs.ratio;
     const float first_u = centre_s * grown - (inputs.corners.data[2 * lens] + 0.5f - inputs.half[0]) * cell;

@@ -67,9 +67,10 @@ struct LensValues {
     V to_a, to_b;                 // from `smeared` to levels
     V a, b, step_a, step_b;       // of profiles: the middle's offset in the lens's frame, and its change per pixel
     V s, t, slope[4], matrix[4];  // of pixels: the middle's offset, its change per pixel, the matrix N of `Bend`
+    LocalBend<V> bend;            // and their change
     V edge[6];                    // of a voxel that is cut: its edges in the lens's frame
 
-    LFPIV_INLINE LensValues(const LensGroup& group, const Top& top, const Bend& bend, M lit) {
+    LFPIV_INLINE LensValues(const LensGroup& group, const Top& top, const Bend& of_voxel, M lit) {
         const Voxel& voxel = group.voxel;
         const LocalFrame<V>& local = group.local;
         columns = lit ? group.columns : V{};
@@ -94,14 +95,15 @@ struct LensValues {
             a = turn[0] * s + turn[1] * t, b = turn[2] * s + turn[3] * t;
             step_a = local.step[0], step_b = local.step[3];
         } else {
-            to_a = LEVELS / (top.a * top.b * top.area * bend.frame_area * wide_a * wide_b);
+            to_a = LEVELS / (top.a * top.b * top.area * of_voxel.frame_area * wide_a * wide_b);
             if (voxel.parts > 1) to_a /= (float)voxel.parts;
             V k[4];
             voxel.slope(group.u, group.v, k);
+            bend = LocalBend<V>(voxel, of_voxel, group.u, group.v);
             for (int n = 0; n < 4; ++n) slope[n] = -voxel.pupil_pixel * k[n];
             for (int n = 0; n < 2; ++n) {
-                matrix[n] = (1.0f - k[0]) * bend.unframe[n] - k[1] * bend.unframe[2 + n];
-                matrix[2 + n] = (1.0f - k[3]) * bend.unframe[2 + n] - k[2] * bend.unframe[n];
+                matrix[n] = (1.0f - k[0]) * of_voxel.unframe[n] - k[1] * of_voxel.unframe[2 + n];
+                matrix[2 + n] = (1.0f - k[3]) * of_voxel.unframe[2 + n] - k[2] * of_voxel.unframe[n];
             }
         }
     }

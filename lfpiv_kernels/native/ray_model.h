@@ -8,7 +8,7 @@
 namespace lfpiv {
 
 /// Floats of a voxel's ray model, see `RayModel`.
-constexpr int MODEL_SIZE = 30;
+constexpr int MODEL_SIZE = 38;
 /// Floats of a camera's geometry, see `Geometry`.
 constexpr int GEOMETRY_SIZE = 23;
 /// Largest 8-bit value.
@@ -24,6 +24,8 @@ struct RayModel {
     float t[6];               // and of t
     float edge[3][2];         // projected voxel edges along x, y, z as (s, t) [mm]
     float edge_change[3][4];  // their change with the pupil point, (s_u, s_v, t_u, t_v)
+    float s3[4];              // coefficients of uuu, uuv, uvv, vvv of s [mm]
+    float t3[4];              // and of t
 };
 static_assert(sizeof(RayModel) == 4 * MODEL_SIZE, "floats only");
 
@@ -132,22 +134,40 @@ struct Voxel {
           rim(camera.radius + RIM * pupil_pixel),
           parts(in.profiles ? 1 : in.cuts[0] * in.cuts[1] * in.cuts[2]) {}
 
+    /// Return s or t of the ray through the pupil point (u, v), from its coefficients of third order `c` and the
+    /// others.
+    template <class T>
+    LFPIV_INLINE static T along(const float* a, const float* c, T u, T v) {
+        return a[0] + u * (a[1] + u * (a[3] + u * c[0] + v * c[1]) + v * a[4]) +
+               v * (a[2] + v * (a[5] + u * c[2] + v * c[3]));
+    }
+    /// Find its derivatives by u and v.
+    template <class T>
+    LFPIV_INLINE static void slope_along(const float* a, const float* c, T u, T v, T* k) {
+        k[0] = a[1] + 2.0f * (a[3] + 1.5f * c[0] * u + c[1] * v) * u + (a[4] + c[2] * v) * v;
+        k[1] = a[2] + (a[4] + c[1] * u) * u + 2.0f * (a[5] + c[2] * u + 1.5f * c[3] * v) * v;
+    }
+
     /// Find (s, t) of the ray through the pupil point (u, v).
     template <class T>
     LFPIV_INLINE void position(T u, T v, T& s, T& t) const {
-        const float *a = model.s, *b = model.t;
-        s = a[0] + u * (a[1] + u * a[3] + v * a[4]) + v * (a[2] + v * a[5]);
-        t = b[0] + u * (b[1] + u * b[3] + v * b[4]) + v * (b[2] + v * b[5]);
+        s = along(model.s, model.s3, u, v);
+        t = along(model.t, model.t3, u, v);
     }
 
     /// Find K = d(s, t)/d(u, v), row by row.
     template <class T>
     LFPIV_INLINE void slope(T u, T v, T* k) const {
-        const float *a = model.s, *b = model.t;
-        k[0] = a[1] + 2.0f * a[3] * u + a[4] * v;
-        k[1] = a[2] + a[4] * u + 2.0f * a[5] * v;
-        k[2] = b[1] + 2.0f * b[3] * u + b[4] * v;
-        k[3] = b[2] + b[4] * u + 2.0f * b[5] * v;
+        slope_along(model.s, model.s3, u, v, k);
+        slope_along(model.t, model.t3, u, v, k + 2);
+    }
+
+    /// Find half the second derivatives of s or t: coefficients of duu, duv, dvv about the pupil point (u, v).
+    template <class T>
+    LFPIV_INLINE static void bend_along(const float* a, const float* c, T u, T v, T* bend) {
+        bend[0] = a[3] + 3.0f * c[0] * u + c[1] * v;
+        bend[1] = a[4] + 2.0f * (c[1] * u + c[2] * v);
+        bend[2] = a[5] + c[2] * u + 3.0f * c[3] * v;
     }
 
     /// Find the projected voxel edge along one axis for the pupil point (u, v).
@@ -192,7 +212,7 @@ struct ReachedLenses {
     float slope[4];      // at the pupil's centre
     float back[4];       // its inverse
     float half[2];       // half extent of (s, t) around a lens's centre within which a ray can reach the lens
-    float bend[2];       // bounds of the second-order terms of s and t per squared distance on the pupil
+    float bend[2];       // bounds of the terms beyond first order of s and t per squared distance on the pupil
     int i0, i1, j0, j1;  // lens indices, ends included; i1 < i0 or j1 < j0 where there are none
     int count;           // number of lenses
     int next_i, next_j;  // the lens that `take` gives next
@@ -208,6 +228,10 @@ struct ReachedLenses {
             half[1] += 0.5f * radius * (abs(k[2]) + abs(k[3]));
         }
         bend[0] = abs(m.s[3]) + abs(m.s[4]) + abs(m.s[5]), bend[1] = abs(m.t[3]) + abs(m.t[4]) + abs(m.t[5]);
+        for (int n = 0; n < 4; ++n) {  // a pupil point of third order moves the second order by at most three times
+            bend[0] += 3.0f * radius * abs(m.s3[n]);
+            bend[1] += 3.0f * radius * abs(m.t3[n]);
+        }
         float inverted[4], spread[2];  // how far the rays spread over the array
         for (int n = 0; n < 4; ++n) inverted[n] = slope[n];
         invert_slope(inverted, back);

@@ -142,28 +142,51 @@ struct Top {
     }
 };
 
-/// How the rays of a voxel bend from pixel to pixel. The matrix N = (I - K) F^-1 turns offsets in the lens's frame F
-/// into (s, t).
+/// How the rays of a voxel bend from pixel to pixel, in third order. The matrix N = (I - K) F^-1 turns offsets in the
+/// lens's frame F into (s, t).
 struct Bend {
-    float unframe[4];                          // F^-1
-    float frame_area;                          // of F
-    float along_column[4];                     // change of N from column to column
-    float along_row[4];                        // and from row to row
-    float s_xx, s_xy, s_yy, t_xx, t_xy, t_yy;  // second order of the offset
+    float unframe[4];                 // F^-1
+    float frame_area;                 // of F
+    float s3[4], t3[4];               // third order of the offset: xxx, xxy, xyy, yyy
+    float n_xx[4], n_xy[4], n_yy[4];  // second order of N
 
     LFPIV_INLINE explicit Bend(const Voxel& voxel) {
         const float pixel = voxel.pupil_pixel, square = pixel * pixel;
-        const float *s = voxel.model.s, *t = voxel.model.t;
         frame_area = abs(1.0f / invert(voxel.camera.frame, unframe));
-        for (int c = 0; c < 2; ++c) {
-            const float a = unframe[c], b = unframe[2 + c];
-            along_column[c] = pixel * (s[4] * b + 2.0f * s[3] * a);
-            along_row[c] = pixel * (s[4] * a + 2.0f * s[5] * b);
-            along_column[2 + c] = pixel * (2.0f * t[3] * a + t[4] * b);
-            along_row[2 + c] = pixel * (t[4] * a + 2.0f * t[5] * b);
+        for (int n = 0; n < 4; ++n) {
+            s3[n] = -square * pixel * voxel.model.s3[n];
+            t3[n] = -square * pixel * voxel.model.t3[n];
         }
-        s_xx = square * s[3], s_xy = square * s[4], s_yy = square * s[5];
-        t_xx = square * t[3], t_xy = square * t[4], t_yy = square * t[5];
+        for (int n = 0; n < 4; ++n) {
+            const float* c = n < 2 ? voxel.model.s3 : voxel.model.t3;
+            const float a = -square * unframe[n % 2], b = -square * unframe[2 + n % 2];
+            n_xx[n] = 3.0f * c[0] * a + c[1] * b;
+            n_xy[n] = 2.0f * (c[1] * a + c[2] * b);
+            n_yy[n] = c[2] * a + 3.0f * c[3] * b;
+        }
+    }
+};
+
+/// The same about the middle of what a lens sees: second order of the offset, and first order of N.
+template <class T>
+struct LocalBend {
+    T s[3], t[3];       // xx, xy, yy of the offset
+    T along_column[4];  // change of N from column to column
+    T along_row[4];     // and from row to row
+
+    LFPIV_INLINE LocalBend() = default;
+    LFPIV_INLINE LocalBend(const Voxel& voxel, const Bend& bend, T u, T v) {
+        const float pixel = voxel.pupil_pixel, square = pixel * pixel;
+        Voxel::bend_along(voxel.model.s, voxel.model.s3, u, v, s);
+        Voxel::bend_along(voxel.model.t, voxel.model.t3, u, v, t);
+        for (int c = 0; c < 2; ++c) {
+            const float a = bend.unframe[c], b = bend.unframe[2 + c];
+            along_column[c] = pixel * (s[1] * b + 2.0f * s[0] * a);
+            along_row[c] = pixel * (s[1] * a + 2.0f * s[2] * b);
+            along_column[2 + c] = pixel * (2.0f * t[0] * a + t[1] * b);
+            along_row[2 + c] = pixel * (t[1] * a + 2.0f * t[2] * b);
+        }
+        for (int n = 0; n < 3; ++n) s[n] = square * s[n], t[n] = square * t[n];
     }
 };
 

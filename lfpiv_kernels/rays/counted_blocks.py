@@ -21,7 +21,7 @@ from lfpiv_kernels import runtime
 from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
 from lfpiv_kernels.weights.microimages import LAYERS
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, Camera
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS, MODEL_SIZE, Camera
 
 MOST_RAYS = 1 << 17
 """Rays per voxel at most."""
@@ -32,9 +32,6 @@ TOP = int(LEVELS)
 """Level of a voxel's largest count."""
 BITS = 30
 """Bits of a point's coordinate."""
-MODEL_SIZE = 38
-"""Floats of a ray model of third order: 10 coefficients of s, 10 of t, terms as in ``count.POWERS``, then the projected
-edges and their slopes as in ``ray_model.MODEL_SIZE``."""
 GPU_LANES = 4096
 """Voxels that a GPU counts at once. Each needs a window."""
 SCRATCH_BYTES = 1 << 28
@@ -79,12 +76,12 @@ def _traced(model, p, q, r, u, v):
     """Return (s, t) [mm] of the ray from (p, q, r) in the voxel [edge] through (u, v) in the pupil [mm]."""
     st = ti.Vector([0.0, 0.0])
     for o in ti.static(range(2)):
-        m, e, f = ti.static(10 * o, 20 + o, 26 + 2 * o)
+        m, c, e, f = ti.static(6 * o, 30 + 4 * o, 12 + o, 18 + 2 * o)
         st[o] = (
             model[m]
-            + u * (model[m + 1] + u * (model[m + 3] + u * model[m + 6]))
-            + v * (model[m + 2] + v * (model[m + 5] + v * model[m + 9]))
-            + u * v * (model[m + 4] + u * model[m + 7] + v * model[m + 8])
+            + u * (model[m + 1] + u * (model[m + 3] + u * model[c]))
+            + v * (model[m + 2] + v * (model[m + 5] + v * model[c + 3]))
+            + u * v * (model[m + 4] + u * model[c + 1] + v * model[c + 2])
             + p * (model[e] + model[f] * u + model[f + 1] * v)
             + q * (model[e + 2] + model[f + 4] * u + model[f + 5] * v)
             + r * (model[e + 4] + model[f + 8] * u + model[f + 9] * v)
@@ -261,10 +258,10 @@ class CountedBlocks:
     def reach(self, model):
         """Return the lowest and the highest lens (i, j) that the rays of each voxel can meet, shapes (voxel, 2)."""
         radius = self._radius
-        terms = model[:, :20].reshape(-1, 2, 10).astype(float)
-        edges = np.abs(model[:, 20:26].reshape(-1, 3, 2)) + radius * np.abs(model[:, 26:38].reshape(-1, 3, 2, 2)).sum(
-            -1
-        )
+        parts = model[:, :12].reshape(-1, 2, 6), model[:, 30:].reshape(-1, 2, 4)
+        terms = np.concatenate(parts, axis=2).astype(float)
+        slopes = np.abs(model[:, 18:30].reshape(-1, 3, 2, 2)).sum(-1)
+        edges = np.abs(model[:, 12:18].reshape(-1, 3, 2)) + radius * slopes
         spread = radius * np.hypot(terms[..., 1], terms[..., 2]) + edges.sum(1) / 2
         spread += radius**2 * np.abs(terms[..., 3:6]).sum(-1) + radius**3 * np.abs(terms[..., 6:]).sum(-1)
         middle = (terms[..., 0] - self._origin) @ self._inverse.T

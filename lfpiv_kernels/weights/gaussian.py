@@ -89,8 +89,10 @@ def _position(inputs: Inputs, particle: int, p: wp.vec2f):
     """Return (s, t) of the particle's ray through a pupil point [mm]."""
     m = inputs.model[particle]
     u, v = p[0], p[1]
-    s = m[0] + u * (m[1] + u * m[3] + v * m[4]) + v * (m[2] + v * m[5])
-    t = m[6] + u * (m[7] + u * m[9] + v * m[10]) + v * (m[8] + v * m[11])
+    s = m[0] + u * (m[1] + u * (m[3] + u * m[30] + v * m[31]) + v * m[4])
+    s += v * (m[2] + v * (m[5] + u * m[32] + v * m[33]))
+    t = m[6] + u * (m[7] + u * (m[9] + u * m[34] + v * m[35]) + v * m[10])
+    t += v * (m[8] + v * (m[11] + u * m[36] + v * m[37]))
     return wp.vec2f(s, t)
 
 
@@ -100,10 +102,10 @@ def _slope(inputs: Inputs, particle: int, p: wp.vec2f):
     m = inputs.model[particle]
     u, v = p[0], p[1]
     return wp.mat22f(
-        m[1] + 2.0 * m[3] * u + m[4] * v,
-        m[2] + m[4] * u + 2.0 * m[5] * v,
-        m[7] + 2.0 * m[9] * u + m[10] * v,
-        m[8] + m[10] * u + 2.0 * m[11] * v,
+        m[1] + 2.0 * (m[3] + 1.5 * m[30] * u + m[31] * v) * u + (m[4] + m[32] * v) * v,
+        m[2] + (m[4] + m[31] * u) * u + 2.0 * (m[5] + m[32] * u + 1.5 * m[33] * v) * v,
+        m[7] + 2.0 * (m[9] + 1.5 * m[34] * u + m[35] * v) * u + (m[10] + m[36] * v) * v,
+        m[8] + (m[10] + m[35] * u) * u + 2.0 * (m[11] + m[36] * u + 1.5 * m[37] * v) * v,
     )
 
 
@@ -128,6 +130,8 @@ def _view(inputs: Inputs, particle: int):
     view.amplitude = wp.abs(wp.determinant(turned)) * cell * cell / (3.14159265 * inputs.radius * inputs.radius)
     m = inputs.model[particle]
     bend = wp.vec2f(wp.abs(m[3]) + wp.abs(m[4]) + wp.abs(m[5]), wp.abs(m[9]) + wp.abs(m[10]) + wp.abs(m[11]))
+    for n in range(4):
+        bend += 3.0 * inputs.radius * wp.vec2f(wp.abs(m[30 + n]), wp.abs(m[34 + n]))
     outer = inputs.radius + cell
     along = view.to_cell @ k
     back = inputs.inverse

@@ -9,7 +9,8 @@ BLOCK_WIDTH: int = native.constant("projector.h", "BLOCK_WIDTH")
 """Largest width of a block of weights [pixel]: one vector load."""
 MODEL_SIZE: int = native.constant("ray_model.h", "MODEL_SIZE")
 """Floats of a voxel's ray model: 6 polynomial coefficients (1, u, v, uu, uv, vv) of s, 6 of t [mm], the projected
-voxel edges along x, y, z as (s, t) [mm], and their change with the pupil point, (s_u, s_v, t_u, t_v) along x, y, z."""
+voxel edges along x, y, z as (s, t) [mm], their change with the pupil point, (s_u, s_v, t_u, t_v) along x, y, z, and 4
+coefficients of third order (uuu, uuv, uvv, vvv) of s and of t."""
 LEVELS: float = native.constant("ray_model.h", "LEVELS")
 """Largest 8-bit value."""
 

@@ -67,7 +67,7 @@ def count(camera=RIGS["square"], grid=GRID, **more):
 def test_count_kernel_equals_its_twin(name):
     camera, first, rays = RIGS[name], 7, 4096
     runtime.device()
-    models = ray_models(camera, np.array([centre_of(camera, place) for place in PLACES_MM]), VOXEL_MM, degree=3)
+    models = ray_models(camera, np.array([centre_of(camera, place) for place in PLACES_MM]), VOXEL_MM, "count")
     counter, microimages = counter_of(camera, rays)
     (part,) = counter.compute(models, first)
     blocks, values, even_blocks, _, scale, ray, height, width, value = part
@@ -102,14 +102,13 @@ def test_count_kernel_equals_its_twin(name):
 def test_rays_of_the_models_are_those_of_the_mapping(name):
     camera, rng = RIGS[name], np.random.default_rng(1)
     for centre in (centre_of(camera, place) for place in PLACES_MM):
-        own = ray_models(camera, np.array([centre]), VOXEL_MM, degree=3)[0].astype(float)
+        own = ray_models(camera, np.array([centre]), VOXEL_MM, "count")[0].astype(float)
         inside, pupil = rng.uniform(-0.5, 0.5, (500, 3)), rng.normal(size=(500, 2))
         pupil *= camera.optics.pupil_radius_mm / np.maximum(np.hypot(*pupil.T), 1)[:, None]
-        u, v = pupil.T
-        st = (own[:20].reshape(2, 10) @ [u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3]).T
+        st = reference.position(own, pupil)
         for axis in range(3):
-            slope = own[26 + 4 * axis : 30 + 4 * axis].reshape(2, 2)
-            st += inside[:, axis, None] * (own[20 + 2 * axis : 22 + 2 * axis] + pupil @ slope.T)
+            slope = own[18 + 4 * axis : 22 + 4 * axis].reshape(2, 2)
+            st += inside[:, axis, None] * (own[12 + 2 * axis : 14 + 2 * axis] + pupil @ slope.T)
         exact = camera.map(np.array(centre) + inside * VOXEL_MM, pupil)
         assert np.abs(st - exact).max() <= EXACT * camera.lattice.pitch_mm
 
@@ -134,7 +133,7 @@ def test_noise_is_below_that_of_random_rays(name, place):
 def test_neighbours_have_errors_of_their_own():
     """The same voxel twice, as two voxels of different numbers."""
     camera = RIGS["square"]
-    models = np.repeat(ray_models(camera, np.array([centre_of(camera, "far")]), VOXEL_MM, degree=3), 2, axis=0)
+    models = np.repeat(ray_models(camera, np.array([centre_of(camera, "far")]), VOXEL_MM, "count"), 2, axis=0)
     twin = reference.counted(
         *(models, 0, counted_blocks.sobol_points(4096), counted_blocks.BITS),
         optics=camera.optics,
@@ -178,7 +177,7 @@ def work():  # of each thread [ns]
 
 runtime.start("cpu", threads=3)
 camera = IdealCamera("square", rotation(45))
-models = ray_models(camera, np.tile((0.02, 0.03, 0.05) @ camera.pose, (60, 1)), 0.1, degree=3)
+models = ray_models(camera, np.tile((0.02, 0.03, 0.05) @ camera.pose, (60, 1)), 0.1, "count")
 counter, _ = counter_of(camera, counted_blocks.MOST_RAYS)
 list(counter.compute(models[:1]))  # compile
 before = work()

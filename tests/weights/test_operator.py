@@ -28,7 +28,7 @@ from lfpiv_kernels.weights.microimages import LAYERS
 
 VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
-TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
+TOLERANCE_TWIN = 3e-3  # float32 polynomials against float64, of the largest weight
 TOLERANCE_SHARE = 2e-6  # [pixel] float32 distances of up to 20 pixels: twice half a unit in the last place
 TOLERANCE_EDGE = 0.012  # relative L2: at the pupil's edge the kernels know how weights fall in steps of LAYER_FALL
 TOLERANCE_EDGES = 0.002  # of a projected edge: what interpolated rays, half a voxel more apart, make of NEAR_PITCH
@@ -36,9 +36,18 @@ FOOTPRINT_MEAN, FOOTPRINT_WORST = 0.02, 0.035  # relative L2 against a converged
 POINTS, SAMPLES = 12, 30  # per voxel edge and pupil axis: noise below 1 %, subtracted by the two counts' difference
 TOLERANCE_PARTS = 0.004  # relative L2: parts share the voxel's slopes and edges of the pupil; a voxel is 1/2000 of so
 TOLERANCE_ESTIMATE = 0.06  # of a thousand sampled voxels' mean bytes: they vary by a third of it, on a regular grid
-SPHERICAL = 0.12  # [pitch at the pupil's edge] third order, which weights do not follow in either form
+SPHERICAL = 0.12  # [pitch at the pupil's edge] third order, which profiles do not follow
 
 VOXELS_MM = np.array([(0.0, 0.0, 0.05), (0.13, 0.2, 0.9), (0.5, 0.6, -0.7), (-0.6, -0.5, 0.8)])
+
+
+class Spherical(IdealCamera):
+    """A camera with a third-order aberration."""
+
+    def map(self, points, pupil):
+        unit = np.asarray(pupil) / self.optics.pupil_radius_mm
+        return super().map(points, pupil) + SPHERICAL * self.lattice.pitch_mm * unit * (unit**2).sum(-1, keepdims=True)
+
 
 RIGS = {
     "aligned": IdealCamera("aligned", rotation(45)),
@@ -48,6 +57,7 @@ RIGS = {
         "hexagonal", rotation(-45), optics=optics(layout="hexagonal"), lattice=lattice("hexagonal", roll_deg=0.4)
     ),
     "mild coma": IdealCamera("mild coma", rotation(45), coma=0.01),
+    "spherical": Spherical("spherical", rotation(45)),
     "rolled 12": IdealCamera("rolled 12", rotation(45, 0, 12)),
     "rolled 40": IdealCamera("rolled 40", rotation(45, 0, 40)),
     "any angle": IdealCamera("any angle", rotation(30, -30, 25), lattice=lattice(roll_deg=-20.0)),
@@ -57,14 +67,6 @@ RIGS = {
     )
     for roll in (15, 30, 60)  # lens rows stand or lie along the sensor, by either neighbour, and half way between
 }
-
-
-class Spherical(IdealCamera):
-    """A camera with a third-order aberration."""
-
-    def map(self, points, pupil):
-        unit = np.asarray(pupil) / self.optics.pupil_radius_mm
-        return super().map(points, pupil) + SPHERICAL * self.lattice.pitch_mm * unit * (unit**2).sum(-1, keepdims=True)
 
 
 def whole(image, window, corner):
@@ -104,7 +106,14 @@ def test_footprint_agrees_with_a_converged_count(name, microlenses):
 
 @pytest.mark.slow(but="aligned-pixels")
 @pytest.mark.parametrize(
-    ("name", "form"), [("aligned", "pixels"), ("hexagonal", "pixels"), ("mild coma", "pixels"), ("aligned", "profiles")]
+    ("name", "form"),
+    [
+        ("aligned", "pixels"),
+        ("hexagonal", "pixels"),
+        ("mild coma", "pixels"),
+        ("spherical", "pixels"),
+        ("aligned", "profiles"),
+    ],
 )
 def test_footprint_kernel_equals_its_twin(name, form):
     camera = RIGS[name]
@@ -112,7 +121,7 @@ def test_footprint_kernel_equals_its_twin(name, form):
     grid = lfpiv.Grid(shape=(1, 1, 1), voxel_mm=VOXEL_MM, first_centre_mm=tuple(centre[::-1]))
     image = lfpiv.build_weights(IdealRig({name: camera}), grid, form=form).image(name, (0, 0, 0))
     twin = reference.footprint(
-        ray_models(camera, centre[None], VOXEL_MM)[0],
+        ray_models(camera, centre[None], VOXEL_MM, form)[0],
         optics=camera.optics,
         lattice=camera.lattice,
         frame=cell_frame(camera.lattice.basis_mm, camera.lattice.layout),
@@ -436,17 +445,12 @@ def test_a_voxel_is_cut_only_along_edges_that_matter():
 
 
 @pytest.mark.slow
-def test_profiles_stay_where_pixels_are_hardly_nearer_and_a_warning_says_why():
+def test_bent_rays_are_followed_to_third_order_and_asked_for_profiles_are_warned_of():
     grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.4, 0.4, 0.4), voxel_mm=VOXEL_MM)
-    rig = IdealRig({"spherical": Spherical("spherical", rotation(45)), "rolled": RIGS["rolled 40"]})
     with collected() as texts:
-        weights = lfpiv.build_weights(rig, grid)
-    assert weights.forms == {"spherical": "profiles", "rolled": "pixels"}
-    errors = weights.profile_errors["spherical"]
-    assert np.mean(errors) > FOOTPRINT_MEAN
-    (text,) = (warning.sentence for warning in texts)
-    assert text.startswith(f"spherical: weights as profiles differ from counted rays by {100 * np.mean(errors):.1f} %")
-    assert "aberrations beyond the second order" in text
+        weights = lfpiv.build_weights(IdealRig({name: RIGS[name] for name in ("spherical", "rolled 40")}), grid)
+    assert set(weights.forms.values()) == {"pixels"} and not texts
+    assert min(weights.profile_errors["spherical"]) > FOOTPRINT_MEAN
     with collected() as texts:
         compare_with_count(lfpiv.build_weights(IdealRig({"rolled": RIGS["rolled 40"]}), grid, form="profiles"))
     assert len(texts) == 1 and "set compute.weights_form to 'auto'" in texts[0].sentence

@@ -175,7 +175,7 @@ class CameraProfiles:
 
         order = (self.axes[1], self.axes[0], self.axes[2])
         planes, down, across = (2 - self.stored.order[axis] for axis in order)
-        return grid_models(self.camera, count, positions_mm, (planes, down, across))
+        return grid_models(self.camera, count, positions_mm, (planes, down, across), "profiles")
 
     def _profiles_of(self, model: np.ndarray, shape: tuple[int, int]) -> tuple[PlaneProfiles | None, np.ndarray]:
         """Return the profiles of a plane of rows and columns, and its turns (strip, 2), from its voxels' ray models."""
@@ -265,14 +265,14 @@ def _seen_by_parts(
     ----------
     camera : CalibratedCamera
         The camera.
-    models : ndarray, shape (row, column, 30)
+    models : ndarray, shape (row, column, 38)
         Ray models of the plane's voxels.
     middle_rows : ndarray, shape (part,)
         Lattice index j of the middle of each part of a strip.
 
     Returns
     -------
-    seen : ndarray, shape (part, column, 30), float32
+    seen : ndarray, shape (part, column, 38), float32
     turns : ndarray, shape (part, 2)
         See `SeparableWeights.turn`.
     """

@@ -131,14 +131,14 @@ def _starts(counts: np.ndarray) -> np.ndarray:
 def _sample(counter: CountedBlocks, stored: StoredGrid, camera: CalibratedCamera) -> tuple[float, float]:
     """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels."""
     sample = np.unique(np.linspace(0, stored.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    models = ray_models(camera, stored.centres_mm(sample), stored.voxel_mm, degree=3)
+    models = ray_models(camera, stored.centres_mm(sample), stored.voxel_mm, "count")
     batch = _joined(counter.compute(models))
     return float(batch["blocks"].mean()), float(batch["values"].mean())
 
 
 def _model_batches(stored: StoredGrid, camera: CalibratedCamera) -> Iterator[np.ndarray]:
     """Yield the ray models of whole planes of voxels, some planes at a time."""
-    planes = stored.models(camera, degree=3)
+    planes = stored.models(camera, "count")
     step = max(1, BATCH_VOXELS * stored.shape[0] // stored.size)
     with threadpool_limits(1, "blas"):  # one product per plane is too small for BLAS's own threads
         while some := list(islice(planes, step)):

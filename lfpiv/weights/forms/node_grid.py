@@ -152,12 +152,12 @@ class NodeGrid:
         steps[:, [0, 2]] += self._parts(self._first_layer + self.distance * steps[:, 1])
         return self.positions_mm(steps)
 
-    def models(self, camera: CalibratedCamera) -> Iterator[np.ndarray]:
+    def models(self, camera: CalibratedCamera, form: str = "pixels") -> Iterator[np.ndarray]:
         """Yield the ray models of the nodes, row by row."""
         world = [2 - self.stored.order[axis] for axis in self.axes]
         depth = world[1]
         parts = self._parts(self._first_layer + self.distance * np.arange(self._planes))
-        for model in grid_models(camera, self.shape, self.positions_mm, (world[0], world[1], world[2])):
+        for model in grid_models(camera, self.shape, self.positions_mm, (world[0], world[1], world[2]), form):
             model[:, 12 + 2 * depth : 14 + 2 * depth] /= self.distance  # edges are those of voxels
             model[:, 18 + 4 * depth : 22 + 4 * depth] /= self.distance
             of_planes = model.reshape(*self.shape[1:], -1)
