@@ -1,7 +1,7 @@
 """Warp: area-integrated weights of voxels, written as 8-bit blocks of rays.
 
 The weight of a ray is the fraction of a voxel's light, uniform in the voxel and over the pupil, that reaches its pixel
-through its lens: Eq. 10, integrated in closed form instead of counted. A voxel's mapping is a second-order polynomial
+through its lens: Eq. 10, integrated in closed form instead of counted. A voxel's mapping is a third-order polynomial
 of the pupil point, (s, t)(P) with P = (u, v); K = d(s, t)/dP. A pixel at X under the lens centred at c looks through
 the centre of its lens at P = -(X - c (1 + r)) / r, r = f_m/s_i (Eq. 9 solved for u). Then
 
