@@ -13,6 +13,8 @@ constexpr int MODEL_SIZE = 38;
 constexpr int GEOMETRY_SIZE = 23;
 /// Largest 8-bit value.
 constexpr float LEVELS = 255.0f;
+/// Largest u^2 v on the unit circle.
+constexpr float MIXED = 0.385f;
 /// Smallest smear, in pitches or mm: keeps the closed form finite.
 constexpr float NARROWEST = 1e-4f;
 /// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
@@ -212,7 +214,8 @@ struct ReachedLenses {
     float slope[4];      // at the pupil's centre
     float back[4];       // its inverse
     float half[2];       // half extent of (s, t) around a lens's centre within which a ray can reach the lens
-    float bend[2];       // bounds of the terms beyond first order of s and t per squared distance on the pupil
+    float bend[2];       // bounds of the second-order terms of s and t per squared distance on the pupil
+    float third[2];      // bounds of the third-order terms per cubed distance
     int i0, i1, j0, j1;  // lens indices, ends included; i1 < i0 or j1 < j0 where there are none
     int count;           // number of lenses
     int next_i, next_j;  // the lens that `take` gives next
@@ -228,16 +231,14 @@ struct ReachedLenses {
             half[1] += 0.5f * radius * (abs(k[2]) + abs(k[3]));
         }
         bend[0] = abs(m.s[3]) + abs(m.s[4]) + abs(m.s[5]), bend[1] = abs(m.t[3]) + abs(m.t[4]) + abs(m.t[5]);
-        for (int n = 0; n < 4; ++n) {  // a pupil point of third order moves the second order by at most three times
-            bend[0] += 3.0f * radius * abs(m.s3[n]);
-            bend[1] += 3.0f * radius * abs(m.t3[n]);
-        }
+        third[0] = abs(m.s3[0]) + MIXED * (abs(m.s3[1]) + abs(m.s3[2])) + abs(m.s3[3]);
+        third[1] = abs(m.t3[0]) + MIXED * (abs(m.t3[1]) + abs(m.t3[2])) + abs(m.t3[3]);
         float inverted[4], spread[2];  // how far the rays spread over the array
         for (int n = 0; n < 4; ++n) inverted[n] = slope[n];
         invert_slope(inverted, back);
         for (int n = 0; n < 2; ++n) {
             const float* k = slope + 2 * n;
-            half[n] += radius * radius * bend[n];
+            half[n] += radius * radius * (bend[n] + radius * third[n]);
             spread[n] = radius * sqrt(k[0] * k[0] + k[1] * k[1]);
         }
         find_range(spread);
@@ -298,7 +299,8 @@ struct ReachedLenses {
         voxel.slope(u, v, k);
         voxel.reach(u, v, k, near);
         invert_slope(k, local);
-        for (int n = 0; n < 2; ++n) near[n] += bend[n] * 0.25f * extent;
+        const V along = 3.0f * sqrt(u * u + v * v) + 0.5f * sqrt(extent);  // third order bends rays off the centre more
+        for (int n = 0; n < 2; ++n) near[n] += (bend[n] + third[n] * along) * 0.25f * extent;
         const V about_u = abs(local[0]) * near[0] + abs(local[1]) * near[1];
         const V about_v = abs(local[2]) * near[0] + abs(local[3]) * near[1];
         voxel.position(u, v, s, t);
