@@ -230,9 +230,11 @@ class Results:
 
     async def _play(self) -> None:
         """Show one moment after the other until it is stopped."""
+        step = int(self.state.r_step)  # counted here: a slow page answers with steps that are over
         while self.state.r_playing:
+            step = (step + 1) % max(1, self.state.r_numbers)
             with self.state:
-                self.state.r_step = (int(self.state.r_step) + 1) % max(1, self.state.r_numbers)
+                self.state.r_step = step
             await asyncio.sleep(1 / FRAMES_PER_S["series"])
 
     def look_along(self, name: str) -> None:
