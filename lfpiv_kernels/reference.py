@@ -53,7 +53,8 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
     frame, rectangles
         From ``lattice.cell_frame`` and ``lattice.cell_rectangles``.
     local : bool
-        Take the slopes of each pixel instead of those of the lens's middle.
+        Take each pixel's slope for its offset in place of the slope at the middle of what the lens sees. Smears follow
+        from the middle.
 
     Returns
     -------
@@ -85,6 +86,13 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
             seen = rough < 4
             at = points[seen].mean(0)
             at *= min(1.0, radius / max(np.linalg.norm(at), 1e-9))
+            k_slope = slope(model, at)
+            turn = np.asarray(frame) @ np.linalg.inv(np.eye(2) - k_slope)
+            edges = [
+                model[12 + 2 * a : 14 + 2 * a] + model[18 + 4 * a : 22 + 4 * a].reshape(2, 2) @ at for a in range(3)
+            ]
+            smear = np.stack([turn @ edge for edge in edges] + list((turn @ k_slope * width).T), axis=1)
+            widths = [two_widths(smear[0]), two_widths(smear[1])]
             for k in np.flatnonzero(seen):
                 distance = np.linalg.norm(points[k])
                 normal = np.sort(np.abs(points[k]) / max(distance, 1e-9))[::-1]
@@ -96,14 +104,7 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
                     continue
                 # the middle of the part of the pixel inside the pupil
                 seen_at = points[k] * (1 - (1 - covered) / 2 * width / max(distance, width))
-                k_slope = slope(model, seen_at if local else at)
-                jacobian = np.linalg.inv(np.eye(2) - k_slope)
-                turn = np.asarray(frame) @ jacobian
-                edges = [
-                    model[12 + 2 * a : 14 + 2 * a] + model[18 + 4 * a : 22 + 4 * a].reshape(2, 2) @ at for a in range(3)
-                ]
-                smear = np.stack([turn @ edge for edge in edges] + list((turn @ k_slope * width).T), axis=1)
-                widths = [two_widths(smear[0]), two_widths(smear[1])]
+                jacobian = np.linalg.inv(np.eye(2) - slope(model, seen_at if local else at))
                 a, b = np.asarray(frame) @ jacobian @ (position(model, seen_at) - centre)
                 inside = sum(
                     (smeared_step(q[1] - a, widths[0]) - smeared_step(q[0] - a, widths[0]))

@@ -28,7 +28,7 @@ from lfpiv_kernels.weights.microimages import LAYERS
 
 VOXEL_MM = 0.1
 LEVEL = 0.5 / raymodel.LEVELS * 1.1  # rounding to 8 bits, in units of the largest weight; the bound is 4-10 % above it
-TOLERANCE_TWIN = 3e-3  # float32 polynomials against float64, of the largest weight
+TOLERANCE_TWIN = 2e-3  # float32 polynomials against float64, of the largest weight
 TOLERANCE_SHARE = 2e-6  # [pixel] float32 distances of up to 20 pixels: twice half a unit in the last place
 TOLERANCE_EDGE = 0.012  # relative L2: at the pupil's edge the kernels know how weights fall in steps of LAYER_FALL
 TOLERANCE_EDGES = 0.002  # of a projected edge: what interpolated rays, half a voxel more apart, make of NEAR_PITCH
