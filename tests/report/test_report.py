@@ -151,7 +151,8 @@ def test_failed_pairs_come_first_among_the_warnings_and_long_lists_end(reported,
 @pytest.mark.slow
 def test_a_series_is_reported_by_instant(reported, tmp_path):
     recording = Recording.of_series(report_run.PAIRS + 2, step=2)
-    experiment = dataclasses.replace(reported.experiment, recording=recording)
+    images = "particles/{camera}/{instant:06d}.tif"
+    experiment = dataclasses.replace(reported.experiment, recording=recording, particle_images=images)
     text = reported.write(tmp_path / "report.html", experiment=experiment)
     page = Page(text)
     shown = re.sub(r"<script.*?</script>|<style.*?</style>|<[^>]*>", " ", text, flags=re.DOTALL)

@@ -40,7 +40,11 @@ def test_a_held_folder_gets_no_second_run(tmp_path):
 def test_a_run_is_paused_resumed_and_stopped():
     from lfpiv.studio import run_process
 
-    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import time; time.sleep(60)"],
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+    )
     run_process.pause(process.pid)
     until_status(process.pid, "paused")
     run_process.resume(process.pid)
