@@ -155,7 +155,7 @@ class _Columns:
     def in_mm(self, roles: Sequence[str], rows: np.ndarray, stated: Mapping[str, str], **scale: float) -> np.ndarray:
         """Return some rows of some roles [mm], shape (row, role); NaN for marks of missing values.
 
-        `stated` are units that the file does not have; `scale` is that of `names.to_mm`.
+        `stated` are units that the file does not have; `scale` as in `names.to_mm`.
         """
         values = []
         for role in roles:

@@ -165,7 +165,7 @@ def compare_with_nominal(
     No result depends on the stated values. A difference shows rotated images or a wrong spacing of dots or planes, and
     no other check finds them. The magnification is compared only where the thin lens fits the labels, so not behind a
     tilted window. `residual_pitch` is the labels' median distance from the fitted thin lens [microlens pitch].
-    `surface` is that of a liquid that explains the labels in place of the thin lens.
+    `surface` is a liquid's surface if it explains the labels and the thin lens does not.
     """
     stated = setup.orientation
     rotation = (fitted if surface is None else surface.lens).rotation

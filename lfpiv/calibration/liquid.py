@@ -60,10 +60,7 @@ class LiquidSurface:
         )  # fmt: skip
         local, at = (points - lens.offset_mm) @ lens.rotation.T, lens.pupil_scale * pupil
         seen = apparent_points(local, at, lens.object_distance_mm, plates)
-        magnification = lens.image_distance_mm / (lens.object_distance_mm - seen[:, 2:])
-        gain = 1 - lens.image_distance_mm / lens.focal_length_mm + magnification
-        array: np.ndarray = lens.array_offset_mm + gain * at - magnification * seen[:, :2]
-        return array
+        return lens.onto_array(seen, pupil)
 
 
 def liquid_surface(dots: BoardDots, lens: ThinLensModel, optics: Optics) -> LiquidSurface | None:

@@ -90,7 +90,10 @@ class ThinLensModel:
         ndarray, shape (n, 2)
             Positions (s, t) where the rays meet the array [mm].
         """
-        camera = (np.asarray(points, float) - self.offset_mm) @ self.rotation.T
+        return self.onto_array((np.asarray(points, float) - self.offset_mm) @ self.rotation.T, pupil)
+
+    def onto_array(self, camera: np.ndarray, pupil: np.ndarray) -> np.ndarray:
+        """Trace rays as a call does, from points in the axes of the camera [mm], shape (n, 3)."""
         magnification = self.image_distance_mm / (self.object_distance_mm - camera[:, 2:])
         gain = self.pupil_scale * (1 - self.image_distance_mm / self.focal_length_mm + magnification)
         array: np.ndarray = self.array_offset_mm + gain * np.asarray(pupil, float) - magnification * camera[:, :2]

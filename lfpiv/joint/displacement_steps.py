@@ -9,7 +9,7 @@ nodes. Conjugate gradients, preconditioned by the light near each node, solve fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,19 +36,16 @@ SECOND_DIFFERENCES = 18.0
 
 @dataclass(frozen=True)
 class Residual:
-    """Images of a model beside the recorded ones."""
+    """Images of a frame by the model beside the recorded ones."""
 
-    volumes: tuple[np.ndarray, np.ndarray]
-    """Volume of each frame, shape (z, y, x), float32."""
-    exponents: tuple[np.ndarray, np.ndarray]
-    """G' e_f of each frame, shape (z, y, x), float32."""
-    of_frame: tuple[tuple[float, float], tuple[float, float]]
-    """||I - P|| / ||I|| and misfit [counts] of each frame."""
-
-    @property
-    def misfit(self) -> float:
-        """Sum of the misfits of both frames [counts]."""
-        return self.of_frame[0][1] + self.of_frame[1][1]
+    volume: np.ndarray
+    """Volume of the frame, shape (z, y, x), float32."""
+    exponent: np.ndarray
+    """G' e_f, shape (z, y, x), float32."""
+    relative: float
+    """||I - P|| / ||I||."""
+    misfit: float
+    """SMART's misfit [counts]."""
 
 
 @dataclass(frozen=True)
@@ -135,17 +132,11 @@ class DisplacementSteps:
         self._part = RayPart(model.weights, part)
         self._scale: np.ndarray | None = None
 
-    def residual(self, light: np.ndarray, transports: tuple[Transport, Transport]) -> Residual:
-        """Compare the images of the model with the recorded ones."""
-        (first, e_first, of_first), (second, e_second, of_second) = (
-            self._residual(number, light, transport) for number, transport in enumerate(transports)
-        )
-        return Residual((first, second), (e_first, e_second), (of_first, of_second))
+    def residuals(self, light: np.ndarray, transports: tuple[Transport, Transport]) -> list[Residual]:
+        """Compare the images of both frames by the model with the recorded ones."""
+        return [self._residual(number, light, transport) for number, transport in enumerate(transports)]
 
-    def _residual(
-        self, frame: int, light: np.ndarray, transport: Transport
-    ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-        """Return the volume of a frame, its G' e_f, and its residual and misfit."""
+    def _residual(self, frame: int, light: np.ndarray, transport: Transport) -> Residual:
         model, prepared = self.model, self.model.frames[frame]
         volume, equations = model.volume(frame, light, transport), prepared.equations
         with equations.locked():
@@ -155,25 +146,26 @@ class DisplacementSteps:
             misfit = equations.measured()
         norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
         back = model.sieved(model.weights.stored.restore(exponent))
-        return volume, back, (float(np.sqrt(misfit.squares / norm)), misfit.divergence)
+        return Residual(volume, back, float(np.sqrt(misfit.squares / norm)), misfit.divergence)
 
-    def gradient(self, light: np.ndarray, transports: tuple[Transport, Transport], residual: Residual) -> np.ndarray:
+    def gradient(
+        self, light: np.ndarray, transports: tuple[Transport, Transport], residuals: Sequence[Residual]
+    ) -> np.ndarray:
         """Return the derivative of the misfit by the nodes."""
         model, total = self.model, np.zeros((3, *light.shape), np.float32)
         for number, transport in enumerate(transports):
-            total -= transport.pull_slope(residual.exponents[number], model.light_of(number, light))
+            total -= transport.pull_slope(residuals[number].exponent, model.light_of(number, light))
         return model.field.adjoint(total)
 
     def curvature(
-        self, light: np.ndarray, transports: tuple[Transport, Transport], residual: Residual
+        self, light: np.ndarray, transports: tuple[Transport, Transport], residuals: Sequence[Residual]
     ) -> Callable[[np.ndarray], np.ndarray]:
         """Return the map from a change of the nodes to a change of the gradient."""
         model = self.model
         own = [model.light_of(number, light) for number in range(2)]
         shares = [self._part.share(frame.images) for frame in model.frames]
         curvatures = [
-            self._part.curvatures(volume, frame.images)
-            for volume, frame in zip(residual.volumes, model.frames, strict=True)
+            self._part.curvatures(one.volume, frame.images) for one, frame in zip(residuals, model.frames, strict=True)
         ]
 
         def change(nodes: np.ndarray) -> np.ndarray:
@@ -190,10 +182,11 @@ class DisplacementSteps:
         """Return a step of the nodes by some conjugate gradient steps, times a factor, and at most `LARGEST_MOVE`."""
         model = self.model
         transports = model.transports(nodes)
-        residual = self.residual(light, transports)
-        gradient = self.gradient(light, transports, residual)
-        curvature = self.curvature(light, transports, residual)
-        rough = ROUGH * 2 * residual.misfit / self._lit_pixels
+        residuals = self.residuals(light, transports)
+        misfit = sum(one.misfit for one in residuals)
+        gradient = self.gradient(light, transports, residuals)
+        curvature = self.curvature(light, transports, residuals)
+        rough = ROUGH * 2 * misfit / self._lit_pixels
         scale = self._curvature_scale(curvature, nodes)
         floor = LEAST_CURVATURE * float(scale.mean())
         near = model.field.adjoint(np.broadcast_to(light, (3, *light.shape)))
@@ -210,7 +203,7 @@ class DisplacementSteps:
         largest = float(np.abs(model.field.values(change)).max())
         if largest > LARGEST_MOVE:
             change *= LARGEST_MOVE / largest
-        return Step(change, residual.misfit)
+        return Step(change, misfit)
 
     @property
     def _lit_pixels(self) -> int:

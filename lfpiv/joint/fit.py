@@ -68,8 +68,8 @@ class JointFit:
     """Misfit over that of the frames by themselves."""
     lossy: bool
     """Whether brightness may differ between the frames."""
-    residual: Residual
-    """Of the result."""
+    residuals: Sequence[Residual]
+    """Of both frames of the result."""
 
 
 def fit_pair(
@@ -113,8 +113,9 @@ def fit_pair(
                 nodes, number = first, 0
         if not now.fresh and moved < SETTLED_VOXEL:
             break
-    residual = movement.residual(light.values, model.transports(nodes))
-    return JointFit(light.values, nodes, done, residual.misfit / alone, model.rho is not None, residual)
+    residuals = movement.residuals(light.values, model.transports(nodes))
+    ratio = sum(one.misfit for one in residuals) / alone
+    return JointFit(light.values, nodes, done, ratio, model.rho is not None, residuals)
 
 
 def _loss(model: JointModel, found: Sequence[Reconstruction], nodes: np.ndarray) -> np.ndarray | None:

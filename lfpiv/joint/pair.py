@@ -182,15 +182,12 @@ class PairSolver:
         model = JointModel(weights, prepared)
         fit = fit_pair(model, alone.frames, model.field.fitted_to(vectors), progress)
         log.info("joint fit: %d rounds, misfit %.2f of the frames by themselves", fit.rounds, fit.misfit_ratio)
-        transports = model.transports(fit.nodes)
         frames = []
-        for number, own in enumerate(alone.frames):
-            volume = model.volume(number, fit.light, transports[number])
-            seen = weights.stored.restore(to_host(prepared[number].normalisation.lit)) > 0
-            volume = np.where(seen, volume, np.float32(0)).astype(np.float32)
-            residual, misfit = fit.residual.of_frame[number]
-            residuals, misfits = (*own.residual, residual), (*own.misfit, misfit)
-            frames.append(replace(own, volume=volume, residual=residuals, misfit=misfits))
+        for own, frame, end in zip(alone.frames, prepared, fit.residuals, strict=True):
+            seen = weights.stored.restore(to_host(frame.normalisation.lit)) > 0
+            volume = np.where(seen, end.volume, np.float32(0)).astype(np.float32)
+            residual, misfit = (*own.residual, end.relative), (*own.misfit, end.misfit)
+            frames.append(replace(own, volume=volume, residual=residual, misfit=misfit))
         return PairResult(
             frames=(frames[0], frames[1]), unshared=alone.frames, estimate=Estimate.JOINT, model=model, fit=fit
         )

@@ -194,7 +194,7 @@ class Judgement:
     left: Mapping[Mistake, Sequence[np.ndarray]]
     """Mistake -> light that is unexplained without it, of each frame that was tried."""
     chance: Sequence[Mistake]
-    """What replaces an image by that of other particles."""
+    """What replaces an image by one of other particles."""
     turned: Mapping[Mistake, Sequence[np.ndarray]] = field(default_factory=dict)
     """Mistake -> light that is unexplained without it and with an image turned, of the likeliest mistake."""
 
@@ -320,7 +320,7 @@ def judge(
 
 
 class _Trials:
-    """Trials of mistakes with the images of a pair; the arguments are those of `judge`."""
+    """Trials of mistakes with the images of a pair; arguments as of `judge`."""
 
     def __init__(self, fit: ImageFit, shown: Shown, pair: int, others: Sequence[int]):
         self._fit, self._shown, self._pair = fit, shown, pair
@@ -329,7 +329,7 @@ class _Trials:
         late = [number for number in others if shown(pair + number, 0) is not None]
         of_other_pairs = [Mistake(Kind.LATE, (name,), number) for number in late for name in _one_of_two(cameras)]
         self.chance = of_other_pairs or [Mistake(Kind.CHANCE, (name,)) for name in cameras]
-        """What replaces an image by that of other particles."""
+        """What replaces an image by one of other particles."""
 
     def judged(self, mistakes: Iterable[Mistake], count: int) -> Judgement:
         """Try mistakes with the first `count` frames; return the judgement by all trials so far."""

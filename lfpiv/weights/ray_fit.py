@@ -94,8 +94,8 @@ def bent_pitch(camera: CalibratedCamera, points_mm: np.ndarray, degree: int) -> 
 def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, form: str = "pixels") -> np.ndarray:
     """Return ray models of single voxels, see `grid_models`.
 
-    The projected edges are differences of the mapping between opposite faces of the voxel. `form` is that of the
-    weights, or "count" for third order.
+    The projected edges are differences of the mapping between opposite faces of the voxel. `form` as in
+    `grid_models`.
 
     Returns
     -------

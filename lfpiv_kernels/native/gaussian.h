@@ -68,11 +68,8 @@ struct Particle {
     /// Where rays through the pupil points (u, v) pass the lens's centre, along an axis of the cell [pitch].
     LFPIV_INLINE void pass(V u, V v, V& a, V& b) const {
         const float* m = model;
-        const float *p = m + 30, *q = m + 34;
-        const V s = m[0] - centre_s + u * (m[1] + u * (m[3] + u * p[0] + v * p[1]) + v * m[4]) +
-                    v * (m[2] + v * (m[5] + u * p[2] + v * p[3]));
-        const V t = m[6] - centre_t + u * (m[7] + u * (m[9] + u * q[0] + v * q[1]) + v * m[10]) +
-                    v * (m[8] + v * (m[11] + u * q[2] + v * q[3]));
+        const V s = Voxel::along(m[0] - centre_s, m, m + 30, u, v);
+        const V t = Voxel::along(m[6] - centre_t, m + 6, m + 34, u, v);
         a = along(0, s, t);
         b = along(1, s, t);
     }

@@ -136,11 +136,11 @@ struct Voxel {
           rim(camera.radius + RIM * pupil_pixel),
           parts(in.profiles ? 1 : in.cuts[0] * in.cuts[1] * in.cuts[2]) {}
 
-    /// Return s or t of the ray through the pupil point (u, v), from its coefficients of third order `c` and the
-    /// others.
+    /// Return s or t of the ray through the pupil point (u, v), from its `first` coefficient, those of third order `c`
+    /// and the others.
     template <class T>
-    LFPIV_INLINE static T along(const float* a, const float* c, T u, T v) {
-        return a[0] + u * (a[1] + u * (a[3] + u * c[0] + v * c[1]) + v * a[4]) +
+    LFPIV_INLINE static T along(float first, const float* a, const float* c, T u, T v) {
+        return first + u * (a[1] + u * (a[3] + u * c[0] + v * c[1]) + v * a[4]) +
                v * (a[2] + v * (a[5] + u * c[2] + v * c[3]));
     }
     /// Find its derivatives by u and v.
@@ -153,8 +153,8 @@ struct Voxel {
     /// Find (s, t) of the ray through the pupil point (u, v).
     template <class T>
     LFPIV_INLINE void position(T u, T v, T& s, T& t) const {
-        s = along(model.s, model.s3, u, v);
-        t = along(model.t, model.t3, u, v);
+        s = along(model.s[0], model.s, model.s3, u, v);
+        t = along(model.t[0], model.t, model.t3, u, v);
     }
 
     /// Find K = d(s, t)/d(u, v), row by row.

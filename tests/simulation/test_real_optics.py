@@ -256,7 +256,7 @@ def test_dots_traced_forward_and_backward_agree(device, scene_camera, uneven, no
     """Two independent kernels, one radiometry: light of a dot = level x microimage x lenses that its image covers.
 
     Forward rays leave a dot evenly towards the pupil. A radiant tilted board favours one side of the pupil, and
-    aberrations stretch the image unevenly. `noise` is that of the rays.
+    aberrations stretch the image unevenly. `noise` is the rays' noise.
     """
     renderer, dots = render_camera(scene_camera), np.array([[-0.1, 0, 0.1], [0.1, 0, 0.1]])
     lenses = np.pi * 0.05**2 * image_area(scene_camera, dots) / abs(np.linalg.det(renderer.basis_mm))
