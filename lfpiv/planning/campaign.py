@@ -6,36 +6,52 @@ import logging
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.files import size_text
-from lfpiv.planning.first_pair import FirstPair, board_cost, measure
 from lfpiv.planning.result import Cost, Disk, Memory, Plan, Time
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.refinement import LARGEST
-from lfpiv.runs import device_memory, memory, rig, worker_plan
+from lfpiv.results.folder import Folder
+from lfpiv.results.pair_files import FrameVolume, PairVolumes
+from lfpiv.runs import belonging, device_memory, memory, rig, worker_plan
+from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.run import Run, open_run
 from lfpiv.velocity import vector_grid
+from lfpiv.warn import collected
+from lfpiv.weights.checks import compare_with_count
 from lfpiv.weights.memory_left import rays_bytes
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import cores
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
+    from lfpiv.weights.operator import Weights
 
 log = logging.getLogger(__name__)
 
+Result = TypeVar("Result")
+
 FIRST_PAIR = "first pair"
 """Name of the step, for progress."""
+PER_MICROLENS = 0.5
+"""Simulated particles per microlens: a seeding that cameras of this kind resolve."""
+BRIGHTEST, NOISE = 1000.0, 10.0
+"""Light of the brightest simulated pixel, and standard deviation of the simulated noise [counts]."""
+SHIFT_VOXEL = 1
+"""Displacement of the simulated particles along each axis [reconstructed voxel]."""
+SEED = 18
 
 
 def plan(
@@ -50,7 +66,8 @@ def plan(
     """Say what a campaign will take, before it begins.
 
     The first pair is done as in a run, with simulated particles where its images are not there yet, and its times are
-    scaled. So it takes as long as the weights and two pairs. Nothing is written.
+    scaled. So it takes as long as the weights and two pairs. What a run does once before the weights, such as the
+    calibration, is not in the plan. Nothing is written.
 
     Parameters
     ----------
@@ -80,8 +97,11 @@ def plan(
     """
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    pairs = _whole("--pairs", experiment.pairs if pairs is None else pairs)
-    workers = None if workers is None else _whole("--workers", workers, worker_plan.MAX_WORKERS)
+    pairs = experiment.pairs if pairs is None else pairs
+    asked = 1 if workers is None else workers
+    for name, value, most in (("--pairs", pairs, 10**9), ("--workers", asked, worker_plan.MAX_WORKERS)):
+        if type(value) is not int or not 1 <= value <= most:
+            raise InputError(f"{name}: expected a whole number from 1 to {most}, found {value!r}.")
     shared = experiment
     if workers is not None:  # they share the threads
         threads = max((experiment.compute.threads or cores()) // min(workers, pairs), 1)
@@ -97,12 +117,6 @@ def plan(
                 return _plan(current, pairs, min(workers, pairs), Path(scratch), out is not None)
 
 
-def _whole(name: str, value: object, most: int = 10**9) -> int:
-    if type(value) is not int or not 1 <= value <= most:
-        raise InputError(f"{name}: expected a whole number from 1 to {most}, found {value!r}.")
-    return value
-
-
 def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Plan:
     """Measure the first pair and scale it. `run` has the threads of one worker."""
     step = run.step(FIRST_PAIR)
@@ -116,18 +130,8 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     worker_plan.require_memory(finest, estimated, 1)
     memory_of(run, estimated, workers)
     step(0.1)
-    prepared = dict[str, Cost]()
-    if not calibrated and (cost := board_cost(experiment, calibration)) is not None:
-        prepared["calibration"] = cost
-    elif not calibrated:
-        assumptions.append("the time of the calibration is not in the plan: two planes of the board do not show it")
-    first = measure(run, calibration, scratch, calibrated=calibrated)
+    first = _first_pair(run, calibration, scratch, calibrated, assumptions)
     step(0.9)
-    if not first.recorded:
-        assumptions.append("particle images are read as fast as the white images: there are none yet")
-    if run.guard is None or not calibrated:
-        prepared["images"] = first.images
-    prepared |= {"weights": first.weights, "cameras": first.cameras}
     need = memory_of(run, first.weights_bytes + maps, workers)
     disk = Disk(
         pair=first.file_bytes,
@@ -136,6 +140,10 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
         weights=need.weights if workers > 1 else 0,
         free=shutil.disk_usage(run.folder.path if stored else Path.cwd()).free,
     )
+    pair = sum(first.steps.values(), Cost())
+    simulated = experiment.bootstrap.count(pairs)
+    again = pair * (simulated + 1 if simulated else 0)
+    total = sum(first.prepared.values(), Cost()) + first.once + pair * math.ceil(pairs / workers) + again
     step(1.0)
     return Plan(
         name=experiment.name,
@@ -149,7 +157,14 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
         reconstructed=finest.grid.shape,
         reconstructed_mm=finest.grid.voxel_mm,
         vectors=vector_grid.planned(experiment.correlation, experiment.grid.shape).count,
-        time=_scaled(experiment, first, prepared, pairs, workers),
+        time=Time(
+            preparation=first.prepared,
+            first=first.once,
+            pair=pair,
+            steps=first.steps,
+            simulated=again,
+            total_s=total.wall_s,
+        ),
         memory=need,
         disk=disk,
         limits=tuple(limits_of(finest, need, disk, first.steps, workers)),
@@ -157,15 +172,95 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     )
 
 
-def _scaled(experiment: Experiment, first: FirstPair, prepared: Mapping[str, Cost], pairs: int, workers: int) -> Time:
-    """Return the time of the campaign."""
-    pair = sum(first.steps.values(), Cost())
-    simulated = experiment.bootstrap.count(pairs)
-    again = pair * (simulated + 1 if simulated else 0)
-    total = sum(prepared.values(), Cost()) + first.once + pair * math.ceil(pairs / workers) + again
-    return Time(
-        preparation=prepared, first=first.once, pair=pair, steps=first.steps, simulated=again, total_s=total.wall_s
+@dataclass(frozen=True, kw_only=True)
+class _FirstPair:
+    """What the first pair takes."""
+
+    prepared: Mapping[str, Cost]
+    """Weights with their check, and where the cameras show the particles of the pair, as far as it was compared."""
+    once: Cost
+    """What only the first pair needs: loaded kernels, sums of subsets, the estimator of the particles' size."""
+    steps: Mapping[str, Cost]
+    """Costs of a further pair: "images", "reconstruction", "correlation", "writing"."""
+    weights_bytes: int
+    file_bytes: int
+
+
+def _timed(work: Callable[[], Result]) -> tuple[Result, Cost]:
+    """Do some work in this process; return its result and its cost."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    return result, Cost(time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def _first_pair(
+    run: Run, calibration: Calibration, scratch: Path, calibrated: bool, assumptions: list[str]
+) -> _FirstPair:
+    """Do the first pair of a run and measure what it takes; its file goes to a scratch folder."""
+    experiment, number = run.experiment, run.experiment.numbers[0]
+    weights, built = _timed(lambda: rig.weights_of(run, calibration))
+    prepared = {"weights": built + _timed(lambda: compare_with_count(weights))[1]}
+    light, reading = _light(experiment, weights)
+    if reading is None:
+        assumptions.append("particles are simulated: there are no images yet, whose reading is not in the plan")
+    if reading is None or not calibrated:
+        assumptions.append("the comparison of the cameras, once a run, is not in the plan")
+    else:
+        with collected(quiet=True):
+            prepared["cameras"] = _timed(lambda: belonging.check(experiment, weights, experiment.numbers[:1]))[1]
+    work = rig.pair_work(replace(run, folder=Folder(scratch, experiment.recording)), weights, keep_volumes=False)
+    coming = iter(light)
+
+    def solve() -> tuple[FrameVolume, FrameVolume]:
+        if not experiment.recording.is_series:
+            return work.reconstructor.pair(light, lambda _: None)
+        found = work.reconstructor.frame(next(coming), lambda _: None)
+        return found, found
+
+    (_, first), (volumes, solved) = _timed(solve), _timed(solve)
+    both = PairVolumes(frames=volumes, names=experiment.frames)
+    (_, loaded), (vectors, correlated) = (_timed(lambda: work.vectors_between(number, both)) for _ in range(2))
+    file = work.files(number)
+    _, written = _timed(lambda: work.result(file, vectors, both)[1]())
+    images = (reading or Cost()) * experiment.recording.lasers
+    return _FirstPair(
+        prepared=prepared,
+        once=(first - solved) + (loaded - correlated),
+        steps={"images": images, "reconstruction": solved, "correlation": correlated, "writing": written},
+        weights_bytes=weights.memory_bytes,
+        file_bytes=file.vectors.stat().st_size,
     )
+
+
+def _light(experiment: Experiment, weights: Weights) -> tuple[tuple[FrameLight, FrameLight], Cost | None]:
+    """Return the light of both frames and the cost of reading one; simulated light, and None, without images."""
+    first, second = experiment.pair_frames(experiment.numbers[0])
+    darks = read_darks(experiment)
+    try:
+        one = frame_light(experiment, weights.cameras, darks, first)
+        other, cost = _timed(lambda: frame_light(experiment, weights.cameras, darks, second))
+        return (one, other), cost
+    except InputError as error:
+        log.debug("plan: particles are simulated: %s", error)
+    lenses = [
+        len(weights.projector(name).map.pixel) / camera.optics.microimage_pitch_px**2
+        for name, camera in weights.cameras.items()
+    ]
+    rng, found = np.random.default_rng(SEED), []
+    light = np.zeros(weights.grid.shape, np.float32)
+    light.ravel()[rng.integers(0, light.size, max(round(PER_MICROLENS * min(lenses)), 1))] = 1.0
+    for frame, shift in ((first, 0), (second, SHIFT_VOXEL)):
+        images = weights(np.roll(light, (shift,) * 3, (0, 1, 2)))
+        for image in images.values():
+            image *= BRIGHTEST / max(float(image.max()), 1e-30)
+            image += np.float32(NOISE) * rng.standard_normal(image.shape, np.float32)
+        clear, noise = dict.fromkeys(images, 1.0), dict.fromkeys(images, NOISE)
+        found.append(
+            FrameLight(
+                frame=frame, images=images, noise=noise, structure=clear, fingerprints={}, warnings=(), seconds=0.0
+            )
+        )
+    return (found[0], found[1]), None
 
 
 def _calibration(run: Run, stored: bool, assumptions: list[str]) -> tuple[Calibration, bool]:
@@ -184,7 +279,7 @@ def _calibration(run: Run, stored: bool, assumptions: list[str]) -> tuple[Calibr
             f"{run.experiment.path}: camera {bare[0]!r}: expected its orientation or its calibration, found neither. "
             "Add nominal_direction, or run `lfpiv calibrate` and name its folder with --out."
         )
-    assumptions.append("cameras are thin lenses in the stated orientations: they are not calibrated yet")
+    assumptions.append("cameras are thin lenses in the stated orientations; the calibration is not in the plan")
     return thin_lens(run.experiment), False
 
 
@@ -196,6 +291,8 @@ def _with_voxels(run: Run, assumptions: list[str]) -> Run:
         assumptions.append(f'particles are points: voxels are refined by {LARGEST:g}, the most that "auto" chooses')
     if experiment.guard_mm == "auto" and run.guard is None:
         assumptions.append("no light lies beyond the volume: one guard layer on each side")
+    if run.guard is None:
+        assumptions.append("the search of all images for background, guard layers and particle size is not in the plan")
     if experiment.tracking is not None:
         assumptions.append("the time of [tracking] is not in the plan")
     if experiment.in_sequence:

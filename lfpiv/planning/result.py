@@ -39,7 +39,7 @@ class Time:
     """Time of the parts of a campaign."""
 
     preparation: Mapping[str, Cost]
-    """Done once: "calibration", "images", "weights", "cameras". A step whose cost is not known is missing."""
+    """Done once: "weights", and "cameras" where these could be compared."""
     first: Cost
     """What only the first pair of each worker needs."""
     pair: Cost

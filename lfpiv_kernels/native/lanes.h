@@ -1,5 +1,5 @@
-// A warp of 32 lanes with one syntax for both processors: on a GPU each lane is a thread; on the CPU, for tests and for
-// the model of memory traffic, a loop walks the lanes through one phase after the other.
+// A warp of 32 lanes with one syntax for both processors: on a GPU each lane is a thread; on the CPU, for tests, a
+// loop walks the lanes through one phase after the other.
 #ifndef LFPIV_LANES_H
 #define LFPIV_LANES_H
 
@@ -10,16 +10,6 @@ namespace lfpiv {
 /// Lanes of a warp.
 constexpr int LANES_OF_WARP = 32;
 constexpr unsigned ALL_OF_WARP = 0xffffffffu;
-
-/// Count instructions that go through shared memory or from lane to lane; ``perf/traced.h`` does.
-#if !defined(LFPIV_EXCHANGED)
-#define LFPIV_EXCHANGED(count) (void)0
-#endif
-
-/// Say which lane of a warp comes next; ``perf/traced.h`` notes it.
-#if !defined(LFPIV_LANE)
-#define LFPIV_LANE(number) (void)0
-#endif
 
 #if defined(__CUDA_ARCH__)
 
@@ -64,18 +54,12 @@ struct PerLane {
     T all[LANES_OF_WARP];
 
     LFPIV_INLINE T& operator[](int lane) { return all[lane]; }
-    LFPIV_INLINE T of(int lane) const {
-        LFPIV_EXCHANGED(1);
-        return all[lane];
-    }
+    LFPIV_INLINE T of(int lane) const { return all[lane]; }
 };
 
 template <class Phase>
 LFPIV_INLINE void for_lanes(Phase phase) {
-    for (int lane = 0; lane < LANES_OF_WARP; ++lane) {
-        LFPIV_LANE(lane);
-        phase(lane);
-    }
+    for (int lane = 0; lane < LANES_OF_WARP; ++lane) phase(lane);
 }
 
 LFPIV_INLINE void sync_lanes() {}

@@ -164,7 +164,6 @@ struct TileLight {
     float* ray;
 
     LFPIV_INLINE void add(int row, int column, float light) const {
-        LFPIV_EXCHANGED(2);
         if (light != 0.0f && row >= 0 && row < TILE && column >= 0 && column < TILE) ray[row * TILE + column] += light;
     }
 };

@@ -17,10 +17,7 @@ struct SplitTile {
     static constexpr int SIZE = PHASES_OF_TILE * LANES_OF_WARP + PHASES_OF_TILE;
     float* voxels;
 
-    LFPIV_INLINE float& operator[](int k) const {
-        LFPIV_EXCHANGED(1);
-        return voxels[k + k / LANES_OF_WARP];
-    }
+    LFPIV_INLINE float& operator[](int k) const { return voxels[k + k / LANES_OF_WARP]; }
 };
 
 /// Store the voxels of 32 lanes of a plane by phase, as `split_plane` of ``blocks.h`` does. Tasks are numbered (phase
