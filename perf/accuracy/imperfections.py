@@ -1,10 +1,15 @@
-"""Whole runs on images that break one assumption at a time, and all together."""
+"""Whole runs on images that break one assumption at a time, and all together; a page as of `lfpiv reproduce`.
+
+python perf/accuracy/imperfections.py [--out DIR] [--scale small|paper] [--seed N]
+"""
 
 from __future__ import annotations
 
+import argparse
 import functools
 import json
 import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +23,7 @@ from lfpiv import files
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.progress import Progress
-from lfpiv.reproduce import page, plots, rigs, store
+from lfpiv.reproduce import page, plots, rigs, store, study
 from lfpiv.runs import pipeline
 from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene
@@ -276,3 +281,26 @@ def _draw(judged: Mapping[str, dict[str, Any]], path: Path) -> None:
     axes.legend(frameon=False, fontsize=8)
     plots.plain(axes)
     plots.save(drawn, path)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure all rows, or read those that are in the folder."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", default="accuracy", help="folder for the results")
+    parser.add_argument("--scale", choices=study.SCALES, default="small")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    about = "Runs on a rig with the main lens and microlenses of the paper and a smaller volume"
+    page_of = study.Study(title="Beyond the paper", about=about, modules={"imperfections": "imperfections"})
+    study.compute(
+        page_of,
+        ["all"],
+        options.out,
+        options.scale,
+        seed=options.seed,
+        progress=lambda step, fraction: print(f"{100 * fraction:3.0f} % {step}", file=sys.stderr),
+    )
+
+
+if __name__ == "__main__":
+    main()
