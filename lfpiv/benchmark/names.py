@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -16,16 +15,6 @@ ROLES = (*POSITION, *VELOCITY, *DISPLACEMENT, *UNCERTAINTY, VALID, NUMBER)
 """What a variable may be: position, velocity, displacement, standard deviation of either, flag, number of the pair."""
 GROUPS = {"position": POSITION, "velocity": VELOCITY, "displacement": DISPLACEMENT, "uncertainty": UNCERTAINTY}
 """Names for three roles that share a unit."""
-
-STANDARD_NAMES = {
-    "u": ("sea_water_x_velocity", "x_wind", "eastward_sea_water_velocity", "eastward_wind"),
-    "v": ("sea_water_y_velocity", "y_wind", "northward_sea_water_velocity", "northward_wind"),
-    "w": ("upward_sea_water_velocity", "upward_air_velocity"),
-    "x": ("projection_x_coordinate",),
-    "y": ("projection_y_coordinate",),
-    "z": ("height", "depth", "altitude"),
-}
-"""Names of the CF conventions. There is none for a velocity in any other fluid."""
 
 
 def _along(axis: str, u: str) -> dict[str, tuple[str, ...]]:
@@ -51,29 +40,22 @@ COMMON_NAMES: dict[str, tuple[str, ...]] = {
 }
 """Names that are in use, in small letters."""
 
-_LENGTHS = {
-    1.0: ("mm", "millimetre", "millimeter", "millimetres", "millimeters"),
-    1e3: ("m", "metre", "meter", "metres", "meters"),
-    10.0: ("cm", "centimetre", "centimeter"),
-    1e-3: ("um", "µm", "μm", "micrometre", "micrometer", "micron"),
-}
-LENGTHS_MM = {name: factor for factor, names in _LENGTHS.items() for name in names}
+LENGTHS_MM = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3}
 """Unit of length -> millimetres."""
 VOXEL_UNITS = ("voxel", "voxels", "vox", "vx")
 _PER_SECOND = re.compile(r"^(.+?)(?:\s*/\s*(?:s|sec|second)|[\s.*·]+s(?:\^|\*\*)?(?:-1|⁻¹))$")
 _TITLE = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
 
 
-def find_names(variables: Mapping[str, Mapping[str, Any]], given: Mapping[str, str], source: str) -> dict[str, str]:
+def find_names(variables: Sequence[str], given: Mapping[str, str], source: str) -> dict[str, str]:
     """Return which variable has which role.
 
-    A name that is given counts first, then the attribute ``standard_name``, then `COMMON_NAMES`, in small or large
-    letters.
+    A name that is given counts first, then `COMMON_NAMES`, in small or large letters.
 
     Parameters
     ----------
-    variables : mapping
-        Name of a variable -> its attributes.
+    variables : sequence of str
+        Names of the variables.
     given : mapping
         Role -> name of a variable.
     source : str
@@ -86,36 +68,28 @@ def find_names(variables: Mapping[str, Mapping[str, Any]], given: Mapping[str, s
     """
     found = {}
     for role in ROLES:
-        if role in given:
-            if given[role] not in variables:
-                raise InputError(
-                    f"{source}: expected the variable {given[role]!r} of --name {role}, found {_listed(variables)}."
-                )
-            found[role] = given[role]
-            continue
-        standard = STANDARD_NAMES.get(role, ())
-        fitting = [name for name, about in variables.items() if about.get("standard_name") in standard]
-        fitting = fitting or [name for name in variables if name.lower() in COMMON_NAMES[role]]
-        if len(fitting) > 1:
+        fitting = [given[role]] if role in given else [one for one in variables if one.lower() in COMMON_NAMES[role]]
+        if role in given and given[role] not in variables:
             raise InputError(
-                f"{source}: expected one variable for {role}, found {_listed(fitting)}. Choose one by "
-                f"--name {role}=NAME."
+                f"{source}: expected the variable {given[role]!r} of --name {role}, found {_listed(variables)}."
             )
+        if len(fitting) > 1:
+            text = f"found {_listed(fitting)}. Choose one by --name {role}=NAME."
+            raise InputError(f"{source}: expected one variable for {role}, {text}")
         if fitting:
             found[role] = fitting[0]
-    _require(found, POSITION, variables, source)
-    if not any(all(role in found for role in roles) for roles in (VELOCITY, DISPLACEMENT)):
-        _require(found, DISPLACEMENT if any(role in found for role in DISPLACEMENT) else VELOCITY, variables, source)
+    moved = next((roles for roles in (VELOCITY, DISPLACEMENT) if found.keys() >= set(roles)), None)
+    moved = moved or (DISPLACEMENT if found.keys() & set(DISPLACEMENT) else VELOCITY)
+    for quantity, role in [("position", role) for role in POSITION] + [(group_of(moved[0]), role) for role in moved]:
+        if role not in found:
+            text = f"found {_listed(variables)}. Name it by --name {role}=NAME."
+            raise InputError(f"{source}: expected the {quantity} {role}, {text}")
     return found
 
 
-def _require(found: Mapping[str, str], roles: Sequence[str], names: Iterable[str], source: str) -> None:
-    for role in roles:
-        if role not in found:
-            quantity = next(group for group, members in GROUPS.items() if role in members)
-            raise InputError(
-                f"{source}: expected the {quantity} {role}, found {_listed(names)}. Name it by --name {role}=NAME."
-            )
+def group_of(role: str) -> str:
+    """Return the name of the roles that share a unit with a role."""
+    return next((group for group, members in GROUPS.items() if role in members), role)
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -140,7 +114,7 @@ def stated_unit(role: str, name: str, attribute: object, given: Mapping[str, str
     InputError
         If neither states it.
     """
-    group = next((group for group, members in GROUPS.items() if role in members), role)
+    group = group_of(role)
     unit = given.get(role) or given.get(group) or attribute
     if unit is None or not str(unit).strip():
         raise InputError(f"{source}: expected the unit of {name!r}, found none. State it by --unit {group}=UNIT.")

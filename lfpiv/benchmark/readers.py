@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,6 @@ LONGEST_MM = 1e6
 PARTICLE, ROW = "particle", "row"
 """Names of a dimension over particles, and of one over the rows of a table."""
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")
-_SECONDS = ("reconstruction_s", "correlation_s"), ("seconds",), ("computing_time_s",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,12 +134,12 @@ def _numbers(files: Sequence[Path], truth: Truth) -> dict[Path, int]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Columns:
-    """Values of a file, one row per vector, with what it says of them."""
+class _Rows:
+    """Vectors of a file, with what it says of them."""
 
     path: Path
-    values: Mapping[str, np.ndarray]
-    """Role -> values, shape (vector,)."""
+    frame: pd.DataFrame
+    """Role -> values, a row for each vector."""
     named: Mapping[str, str]
     """Role -> name."""
     units: Mapping[str, str]
@@ -148,12 +147,8 @@ class _Columns:
     attributes: Mapping[str, Any]
     of_particles: bool
 
-    def has(self, roles: Sequence[str]) -> bool:
-        """Return whether all of some roles have values."""
-        return all(role in self.values for role in roles)
-
-    def in_mm(self, roles: Sequence[str], rows: np.ndarray, stated: Mapping[str, str], **scale: float) -> np.ndarray:
-        """Return some rows of some roles [mm], shape (row, role); NaN for marks of missing values.
+    def in_mm(self, roles: Sequence[str], stated: Mapping[str, str], **scale: float) -> np.ndarray:
+        """Return some roles [mm], shape (row, role); NaN for marks of missing values.
 
         `stated` are units that the file does not have; `scale` as in `names.to_mm`.
         """
@@ -161,14 +156,13 @@ class _Columns:
         for role in roles:
             name = self.named[role]
             unit = names.stated_unit(role, name, self.units.get(role), stated, str(self.path))
-            values.append(names.to_mm(self.values[role][rows], unit, f"{self.path}: {name}", **scale))
+            values.append(names.to_mm(self.frame[role].to_numpy(float), unit, f"{self.path}: {name}", **scale))
         found = np.stack(values, axis=1)
         return np.where(np.abs(found) < LONGEST_MM, found, np.nan)
 
-    def stated(self, *keys: str) -> np.ndarray | None:
-        """Return the numbers of the first attribute of some names, one or more; None without; refuse others."""
-        name = next((name for name in keys if name in self.attributes), None)
-        if name is None:
+    def stated(self, name: str) -> np.ndarray | None:
+        """Return the numbers of an attribute, one or more; None without; refuse others."""
+        if name not in self.attributes:
             return None
         try:
             found = np.ravel(np.asarray(self.attributes[name], float))
@@ -182,84 +176,83 @@ class _Columns:
 
 def _read_file(path: Path, truth: Truth, options: ReadOptions, number: int | None) -> list[MeasuredField]:
     """Return the vectors of a file, one field for each pair in it; `number` is the pair by its name."""
-    columns = _columns(path, truth, options)
-    if names.NUMBER in columns.values:
-        of_row = columns.values[names.NUMBER]
-        if not np.array_equal(of_row, np.round(of_row)):
-            raise InputError(f"{path}: expected whole numbers in {columns.named[names.NUMBER]!r}, found others.")
-    else:
+    rows = _rows(path, truth, options)
+    if names.NUMBER not in rows.frame:
+        stated = rows.stated("instant" if "instant" in rows.attributes else "pair")
         if options.number is not None:
             number = options.number
-        elif (stated := columns.stated("pair", "instant")) is not None:
+        elif stated is not None:
             number = int(stated[0])
         if number is None:
             raise InputError(
                 f"{path}: expected the number of the {truth.noun}, one of {len(truth.numbers)}, found none. State it "
                 "by --number N, in the file's name, or as a variable or attribute `pair`."
             )
-        of_row = np.full(len(columns.values["x"]), number)
-    return [_field(columns, of_row == one, int(one), truth, options) for one in np.unique(of_row)]
+        rows.frame[names.NUMBER] = number
+    of_row = rows.frame[names.NUMBER]
+    if not (of_row == of_row.round()).all():
+        raise InputError(f"{path}: expected whole numbers in {rows.named[names.NUMBER]!r}, found others.")
+    return [_field(replace(rows, frame=part), int(one), truth, options) for one, part in rows.frame.groupby(of_row)]
 
 
-def _field(columns: _Columns, rows: np.ndarray, number: int, truth: Truth, options: ReadOptions) -> MeasuredField:
+def _field(rows: _Rows, number: int, truth: Truth, options: ReadOptions) -> MeasuredField:
     """Return the rows of one pair in millimetres."""
-    edges = columns.stated("voxel_mm")
+    edges = rows.stated("voxel_mm")
     if edges is not None and not (np.allclose(edges, edges[0]) and edges[0] > 0):
-        raise InputError(f"{columns.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
+        raise InputError(f"{rows.path}: expected the attribute voxel_mm, one edge > 0, found {edges.tolist()}.")
     voxel_mm = truth.voxel_mm if edges is None else float(edges[0])
     scale = {"dt_s": truth.scene.dt_s, "voxel_mm": voxel_mm}
-    moved = names.VELOCITY if columns.has(names.VELOCITY) else names.DISPLACEMENT
-    position = columns.in_mm(names.POSITION, rows, options.units)
-    told = columns.has(names.UNCERTAINTY)
-    uncertainty = columns.in_mm(names.UNCERTAINTY, rows, options.units, **scale) if told else None
-    flag = columns.values.get(names.VALID)
-    is_particles = _are_particles(columns, position, truth, options.kind)
-    memory = columns.stated("memory_mib", "peak_memory_mib")
-    in_voxels = any(columns.units.get(role, "").lower() in names.VOXEL_UNITS for role in moved)
+    moved = names.VELOCITY if rows.named.keys() >= set(names.VELOCITY) else names.DISPLACEMENT
+    position = rows.in_mm(names.POSITION, options.units)
+    told, flag = set(rows.frame) >= set(names.UNCERTAINTY), rows.frame.get(names.VALID)
+    is_particles = _are_particles(rows, position, truth, options.kind)
+    memory = rows.stated("memory_mib")
+    in_voxels = any(rows.units.get(role, "").lower() in names.VOXEL_UNITS for role in moved)
     note = f"no attribute voxel_mm: voxels are taken to be the data set's, {truth.voxel_mm:g} mm"
     return MeasuredField(
         number=number,
         positions_mm=position,
-        displacement_mm=columns.in_mm(moved, rows, options.units, **scale),
-        valid=np.ones(len(position), bool) if flag is None else np.nan_to_num(flag[rows]) > 0,
-        uncertainty_mm=uncertainty,
-        window_mm=None if is_particles else options.window_mm or _window_mm(columns, voxel_mm),
+        displacement_mm=rows.in_mm(moved, options.units, **scale),
+        valid=np.ones(len(position), bool) if flag is None else flag.to_numpy(float) > 0,
+        uncertainty_mm=rows.in_mm(names.UNCERTAINTY, options.units, **scale) if told else None,
+        window_mm=None if is_particles else options.window_mm or _window_mm(rows, voxel_mm),
         is_particles=is_particles,
-        seconds=_seconds(columns) if options.seconds is None else options.seconds,
+        seconds=_seconds(rows) if options.seconds is None else options.seconds,
         memory_mib=None if memory is None else float(memory[0]),
         notes=(note,) if in_voxels and edges is None else (),
     )
 
 
-def _are_particles(columns: _Columns, position_mm: np.ndarray, truth: Truth, kind: str) -> bool:
+def _are_particles(rows: _Rows, position_mm: np.ndarray, truth: Truth, kind: str) -> bool:
     """Return whether vectors belong to particles: as stated, or because they lie on no lattice."""
     if kind != "auto":
         return kind == "particles"
     finite = np.isfinite(position_mm).all(1)
     scattered = bool(finite.any()) and lattice_of(position_mm[finite], truth.voxel_mm) is None
-    return columns.of_particles or scattered
+    return rows.of_particles or scattered
 
 
-def _window_mm(columns: _Columns, voxel_mm: float) -> Point | None:
+def _window_mm(rows: _Rows, voxel_mm: float) -> Point | None:
     """Return the window that the attributes state, edges (x, y, z)."""
-    if (edges := columns.stated("window_mm", "interrogation_window_mm")) is not None:
+    if (edges := rows.stated("window_mm")) is not None:
         if len(edges) not in (1, 3) or edges.min() <= 0:
             found = edges.tolist()
-            raise InputError(f"{columns.path}: expected window_mm, one or three lengths > 0, found {found}.")
+            raise InputError(f"{rows.path}: expected window_mm, one or three lengths > 0, found {found}.")
         x, y, z = np.broadcast_to(edges, 3).tolist()
         return x, y, z
     try:
-        edges = json.loads(columns.attributes["settings"])["windows"][-1]  # of lfpiv, in voxels (z, y, x)
+        edges = json.loads(rows.attributes["settings"])["windows"][-1]  # of lfpiv, in voxels (z, y, x)
         z, y, x = (float(voxel_mm * edge) for edge in edges)
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     return x, y, z
 
 
-def _seconds(columns: _Columns) -> float | None:
-    for group in _SECONDS:
-        if all(name in columns.attributes for name in group):
-            return float(sum(found[0] for name in group if (found := columns.stated(name)) is not None))
+def _seconds(rows: _Rows) -> float | None:
+    """Return the stated time; lfpiv states it in two parts."""
+    for keys in (("reconstruction_s", "correlation_s"), ("seconds",)):
+        if all(key in rows.attributes for key in keys):
+            return float(sum(found[0] for key in keys if (found := rows.stated(key)) is not None))
     return None
 
 
@@ -289,8 +282,8 @@ def _load_table(path: Path) -> xr.Dataset:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a table as text, found that it cannot be read ({error}).") from None
-    head = next((line for line in lines if line.strip("# \t,;")), "")
-    first = lines.index(head) if head else 0
+    first = next((number for number, line in enumerate(lines) if line.strip("# \t,;")), 0)
+    head = lines[first] if lines else ""
     mark = next((one for one in "\t;," if one in head), r"\s+")
     titles = [title.strip().strip('"') for title in re.split(mark, head.lstrip("# \t"))]
     if len(titles) < 6:
@@ -316,53 +309,38 @@ def _load_table(path: Path) -> xr.Dataset:
     return xr.Dataset(variables)
 
 
-def _columns(path: Path, truth: Truth, options: ReadOptions) -> _Columns:
+def _rows(path: Path, truth: Truth, options: ReadOptions) -> _Rows:
     """Return the vectors of a file, whatever the order of its axes."""
     dataset = _load_table(path) if path.suffix.lower() in TABLES else load_netcdf(path)
-    about = _attributes_of(dataset)
-    named = names.find_names(about, options.names, str(path))
+    numbers = [str(name) for name, variable in dataset.variables.items() if variable.dtype.kind in "fiub"]
+    named = names.find_names(numbers, options.names, str(path))
     for name in named.values():
-        if (text := about[name].get("text")) is not None and dataset[name].dims == (ROW,):
+        if (text := dataset[name].attrs.get("text")) is not None and dataset[name].dims == (ROW,):
             raise InputError(f"{path}: expected numbers in the column {name!r}, found {text!r}.")
-    roles = [role for role in named if role not in (names.NUMBER, names.VALID, *names.UNCERTAINTY)]
-    base = {dim for role in roles for dim in dataset[named[role]].dims}
-    parts = {role: dataset[name] for role, name in named.items() if set(dataset[name].dims) <= base}
-    extra = _pair_dimension(path, dataset, named, base)
-    if extra is not None and names.NUMBER not in parts:
-        count = dataset.sizes[extra]
-        if count > len(truth.numbers):
-            most = f"{len(truth.numbers)} {truth.noun}s along {extra!r}"
-            raise InputError(f"{path}: expected at most {most}, found {count}.")
-        parts[names.NUMBER] = xr.DataArray(np.array(truth.numbers[:count]), dims=extra)
-        named[names.NUMBER] = extra
-    even = xr.broadcast(*(part.drop_vars(list(part.coords)) for part in parts.values()))
-    return _Columns(
-        path=path,
-        values={role: np.asarray(part.values, float).ravel() for role, part in zip(parts, even, strict=True)},
-        named=named,
-        units={role: str(about[name]["units"]) for role, name in named.items() if "units" in about.get(name, ())},
-        attributes=dataset.attrs,
-        of_particles=PARTICLE in base,
-    )
-
-
-def _attributes_of(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the attributes of variables of numbers; a coordinate that states its axis gets the standard name."""
-    about = {str(name): dict(dataset[name].attrs) for name in dataset.variables if dataset[name].dtype.kind in "fiub"}
-    for name in set(about) & set(map(str, dataset.coords)):
-        axis = str(about[name].get("axis", "")).lower()
-        if axis in names.POSITION and name.lower() not in names.COMMON_NAMES[axis] and dataset[name].ndim == 1:
-            about[name]["standard_name"] = names.STANDARD_NAMES[axis][0]
-    return about
-
-
-def _pair_dimension(path: Path, dataset: xr.Dataset, named: Mapping[str, str], base: set[Any]) -> str | None:
-    """Return the dimension over pairs, the one that no position has; None if there is none."""
     places = {dim for role in names.POSITION for dim in dataset[named[role]].dims}
+    components = [role for role in named if role in (*names.VELOCITY, *names.DISPLACEMENT)]
+    base = places | {dim for role in components for dim in dataset[named[role]].dims}
+    named = {role: name for role, name in named.items() if set(dataset[name].dims) <= base}
     further = sorted(str(dim) for dim in base - places)
     if len(further) > 1:
         raise InputError(
             f"{path}: expected one dimension beside those of x, y and z, over pairs or instants, found "
             f"{', '.join(further)}. Write one file for each pair."
         )
-    return further[0] if further else None
+    if further and names.NUMBER not in named:
+        (along,) = further
+        if dataset.sizes[along] > len(truth.numbers):
+            most = f"{len(truth.numbers)} {truth.noun}s along {along!r}"
+            raise InputError(f"{path}: expected at most {most}, found {dataset.sizes[along]}.")
+        dataset = dataset.assign_coords({along: np.array(truth.numbers[: dataset.sizes[along]])})
+        named[names.NUMBER] = along
+    frame = dataset[list(named.values())].to_dataframe().reset_index()
+    units = {role: str(dataset[name].attrs["units"]) for role, name in named.items() if "units" in dataset[name].attrs}
+    return _Rows(
+        path=path,
+        frame=pd.DataFrame({role: frame[name] for role, name in named.items()}),
+        named=named,
+        units=units,
+        attributes=dataset.attrs,
+        of_particles=PARTICLE in base,
+    )
