@@ -13,8 +13,6 @@ constexpr int MODEL_SIZE = 38;
 constexpr int GEOMETRY_SIZE = 23;
 /// Largest 8-bit value.
 constexpr float LEVELS = 255.0f;
-/// Largest u^2 v on the unit circle.
-constexpr float MIXED = 0.385f;
 /// Smallest smear, in pitches or mm: keeps the closed form finite.
 constexpr float NARROWEST = 1e-4f;
 /// Width around the pupil within which a pixel still counts as touching it [pixel]: more than its share's rounding.
@@ -207,15 +205,12 @@ struct Voxel {
     }
 };
 
-/// The lenses that a voxel's rays can reach, from its rays to first order about the pupil's centre and bounds of the
-/// rest.
+/// The lenses that a voxel's rays can reach, from straight rays near its own over the whole pupil and bounds of the rest.
 struct ReachedLenses {
     const Voxel& voxel;
     float slope[4];      // at the pupil's centre
-    float back[4];       // its inverse
+    float back[4];       // inverse of the straight rays' slope
     float half[2];       // half extent of (s, t) around a lens's centre within which a ray can reach the lens
-    float bend[2];       // bounds of the second-order terms of s and t per squared distance on the pupil
-    float third[2];      // bounds of the third-order terms per cubed distance
     int i0, i1, j0, j1;  // lens indices, ends included; i1 < i0 or j1 < j0 where there are none
     int count;           // number of lenses
     int next_i, next_j;  // the lens that `take` gives next
@@ -230,20 +225,30 @@ struct ReachedLenses {
             half[0] += 0.5f * radius * (abs(k[0]) + abs(k[1]));
             half[1] += 0.5f * radius * (abs(k[2]) + abs(k[3]));
         }
-        bend[0] = abs(m.s[3]) + abs(m.s[4]) + abs(m.s[5]), bend[1] = abs(m.t[3]) + abs(m.t[4]) + abs(m.t[5]);
-        third[0] = abs(m.s3[0]) + MIXED * (abs(m.s3[1]) + abs(m.s3[2])) + abs(m.s3[3]);
-        third[1] = abs(m.t3[0]) + MIXED * (abs(m.t3[1]) + abs(m.t3[2])) + abs(m.t3[3]);
-        float inverted[4], spread[2];  // how far the rays spread over the array
-        for (int n = 0; n < 4; ++n) inverted[n] = slope[n];
-        invert_slope(inverted, back);
+        float straight[4], spread[2];  // how far the rays spread over the array
         for (int n = 0; n < 2; ++n) {
-            const float* k = slope + 2 * n;
-            half[n] += radius * radius * (bend[n] + radius * third[n]);
+            const float *a = n ? m.t : m.s, *c = n ? m.t3 : m.s3, *k = straight + 2 * n;
+            half[n] += radius * radius * (abs(a[3]) + abs(a[4]) + abs(a[5]));
+            half[n] += straighten(c, radius, slope + 2 * n, straight + 2 * n);
             spread[n] = radius * sqrt(k[0] * k[0] + k[1] * k[1]);
         }
+        invert_slope(straight, back);
         find_range(spread);
         count = i1 < i0 || j1 < j0 ? 0 : (i1 - i0 + 1) * (j1 - j0 + 1);
         next_i = i0, next_j = j0;
+    }
+
+    /// Add to a slope the straight rays that are nearest to the third order `c` over the pupil. Return a bound of the rest.
+    ///
+    /// In polar coordinates, uuu is r^3 (3 cos + cos 3) / 4, uvv is r^3 (cos - cos 3) / 4, and so with sines. Over the
+    /// unit disc r^3 departs from 3/4 r by 1/4 at most.
+    LFPIV_INLINE static float straighten(const float* c, float radius, const float* slope, float* out) {
+        const float square = radius * radius;
+        const float once_u = 0.25f * (3.0f * c[0] + c[2]), once_v = 0.25f * (3.0f * c[3] + c[1]);
+        const float thrice_u = 0.25f * (c[0] - c[2]), thrice_v = 0.25f * (c[1] - c[3]);
+        out[0] = slope[0] + 0.75f * square * once_u, out[1] = slope[1] + 0.75f * square * once_v;
+        return square * radius * (0.25f * sqrt(once_u * once_u + once_v * once_v) +
+                                  sqrt(thrice_u * thrice_u + thrice_v * thrice_v));
     }
 
     /// Find the range of lens indices, only as far as the sensor reaches and one microimage more.
@@ -295,12 +300,17 @@ struct ReachedLenses {
     LFPIV_INLINE void narrow(const Lenses& lenses, V& low_u, V& high_u, V& low_v, V& high_v) const {
         V k[4], local[4], near[2], s, t;
         const V u = 0.5f * (low_u + high_u), v = 0.5f * (low_v + high_v);
-        const V extent = (high_u - low_u) * (high_u - low_u) + (high_v - low_v) * (high_v - low_v);
+        const V wide = 0.5f * (high_u - low_u), tall = 0.5f * (high_v - low_v);
         voxel.slope(u, v, k);
         voxel.reach(u, v, k, near);
         invert_slope(k, local);
-        const V along = 3.0f * sqrt(u * u + v * v) + 0.5f * sqrt(extent);  // third order bends rays off the centre more
-        for (int n = 0; n < 2; ++n) near[n] += (bend[n] + third[n] * along) * 0.25f * extent;
+        for (int n = 0; n < 2; ++n) {
+            const float *a = n ? voxel.model.t : voxel.model.s, *c = n ? voxel.model.t3 : voxel.model.s3;
+            V bent[3];
+            Voxel::bend_along(a, c, u, v, bent);
+            near[n] += wide * wide * (abs(bent[0]) + wide * abs(c[0]) + tall * abs(c[1])) +
+                       tall * tall * (abs(bent[2]) + wide * abs(c[2]) + tall * abs(c[3])) + wide * tall * abs(bent[1]);
+        }
         const V about_u = abs(local[0]) * near[0] + abs(local[1]) * near[1];
         const V about_v = abs(local[2]) * near[0] + abs(local[3]) * near[1];
         voxel.position(u, v, s, t);
