@@ -84,7 +84,8 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
             if rough.min() > 4:
                 continue
             seen = rough < 4
-            at = points[seen].mean(0)
+            lit = rough < 1  # rays in the lens's cell, smeared
+            at = points[lit if lit.any() else seen].mean(0)
             at *= min(1.0, radius / max(np.linalg.norm(at), 1e-9))
             k_slope = slope(model, at)
             turn = np.asarray(frame) @ np.linalg.inv(np.eye(2) - k_slope)

@@ -252,7 +252,7 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.WEIGHTS_DIFFER: (
         "weights as {form} differ from counted rays by {mean:percent1} % (worst voxel {worst:percent1} %), the aim "
-        "is {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from second order by "
+        "is {aim_mean:percent} % ({aim_worst:percent1} %). Cause: {cause} (rays depart from third order by "
         "{bent_pitch:.2f}, a voxel's edge is {wide_pitch:.1f} microlens pitch)"
     ),
     Code.DIVERGED: "SMART: {verdict}",

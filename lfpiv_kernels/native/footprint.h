@@ -198,6 +198,7 @@ struct LensTile {
     const float column0;     // of the tile, in the box
     const uint64_t columns;  // a byte for each column of the tile
     const int ray;           // of the tile's first pixel in the box's first row
+    const float inside;      // distance from the pupil's centre up to which its edge cuts no pixel [pixel]
     const float to_a;
     const Smear<float> smear_a, smear_b;
 
@@ -212,6 +213,7 @@ struct LensTile {
           column0((float)(tile * BLOCK_WIDTH)),
           columns(bytes_below((int)in_memory(values.columns, lens) - tile * BLOCK_WIDTH)),
           ray(ray),
+          inside(voxel.camera.radius / voxel.pupil_pixel - 0.5f),
           to_a(in_memory(values.to_a, lens)),
           smear_a(values.one(values.smear_a, lens)),
           smear_b(values.one(values.smear_b, lens)) {}
@@ -329,7 +331,9 @@ struct LensTile {
     /// What the levels of a column of pixels share.
     struct Column {
         V s, t, s_y, t_y, s_yy, t_yy;  // offset on the main lens, its slope and bend along the rows
+        V s_x, t_x, s_xy, t_xy;        // its slope along the columns, and the change along the rows
         V n[4], n_y[4];                // matrix from that offset to rays in the lens's cell, its change along the rows
+        V away;                        // from the pupil's centre along the columns
     };
 
     /// Return what the levels of columns x from the reference pixel share.
@@ -342,22 +346,36 @@ struct LensTile {
         at.s_y = of(slope[1]) + x * (of(local.s[1]) + x * bend.s3[1]);
         at.t_y = of(slope[3]) + x * (of(local.t[1]) + x * bend.t3[1]);
         at.s_yy = of(local.s[2]) + x * bend.s3[2], at.t_yy = of(local.t[2]) + x * bend.t3[2];
+        at.s_x = of(slope[0]) + x * (2.0f * of(local.s[0]) + 3.0f * x * bend.s3[0]);
+        at.t_x = of(slope[2]) + x * (2.0f * of(local.t[0]) + 3.0f * x * bend.t3[0]);
+        at.s_xy = of(local.s[1]) + 2.0f * x * bend.s3[1], at.t_xy = of(local.t[1]) + 2.0f * x * bend.t3[1];
+        at.away = x - of(values.centre_x);
         for (int n = 0; n < 4; ++n) {
             at.n[n] = of(matrix[n]) + x * (of(local.along_column[n]) + x * bend.n_xx[n]);
             at.n_y[n] = of(local.along_row[n]) + x * bend.n_xy[n];
         }
         return at;
     }
-    /// Return the levels of pixels of a column, y rows from the reference pixel.
+    /// Return the levels of pixels of a column, y rows from the reference pixel. The weight of a pixel that the pupil's
+    /// edge cuts is that of the middle of its part inside.
     LFPIV_INLINE V level_in(const Column& at, V y) const {
-        const V ds = at.s + y * (at.s_y + y * (at.s_yy + y * bend.s3[3]));
-        const V dt = at.t + y * (at.t_y + y * (at.t_yy + y * bend.t3[3]));
+        V ds = at.s + y * (at.s_y + y * (at.s_yy + y * bend.s3[3]));
+        V dt = at.t + y * (at.t_y + y * (at.t_yy + y * bend.t3[3]));
+        const V none = {}, away = y - of(values.centre_y), distance = sqrt(at.away * at.away + away * away);
+        const V outside = min(max(distance - inside, none), splat(1.0f));
+        if (any(outside > 0.0f)) {
+            const V inwards = 0.5f * outside / max(distance, splat(1.0f));
+            const V s_x = at.s_x + y * (at.s_xy + y * bend.s3[2]), t_x = at.t_x + y * (at.t_xy + y * bend.t3[2]);
+            const V s_y = at.s_y + y * (2.0f * at.s_yy + 3.0f * y * bend.s3[3]);
+            const V t_y = at.t_y + y * (2.0f * at.t_yy + 3.0f * y * bend.t3[3]);
+            ds -= inwards * (at.away * s_x + away * s_y), dt -= inwards * (at.away * t_x + away * t_y);
+        }
         const V k0 = at.n[0] + y * (at.n_y[0] + y * bend.n_yy[0]), k1 = at.n[1] + y * (at.n_y[1] + y * bend.n_yy[1]);
         const V k2 = at.n[2] + y * (at.n_y[2] + y * bend.n_yy[2]), k3 = at.n[3] + y * (at.n_y[3] + y * bend.n_yy[3]);
         const V inverse = 1.0f / (k0 * k3 - k1 * k2);
         const V a = (k3 * ds - k1 * dt) * inverse, b = (k0 * dt - k2 * ds) * inverse;
         const V level = abs(inverse) * inside_cell(a, b) * to_a + 0.5f;
-        return min(max(level, V{}), splat(LEVELS));
+        return min(max(level, none), splat(LEVELS));
     }
 
     /// Write the levels of all pixels of `height` rows, 8 to a row.

@@ -68,6 +68,7 @@ struct LensValues {
     V a, b, step_a, step_b;       // of profiles: the middle's offset in the lens's frame, and its change per pixel
     V s, t, slope[4], matrix[4];  // of pixels: the middle's offset, its change per pixel, the matrix N of `Bend`
     LocalBend<V> bend;            // and their change
+    V centre_x, centre_y;         // the pupil's centre from the middle [pixel]
     V edge[6];                    // of a voxel that is cut: its edges in the lens's frame
 
     LFPIV_INLINE LensValues(const LensGroup& group, const Top& top, const Bend& of_voxel, M lit) {
@@ -100,6 +101,7 @@ struct LensValues {
             V k[4];
             voxel.slope(group.u, group.v, k);
             bend = LocalBend<V>(voxel, of_voxel, group.u, group.v);
+            centre_x = group.u / voxel.pupil_pixel, centre_y = group.v / voxel.pupil_pixel;
             for (int n = 0; n < 4; ++n) slope[n] = -voxel.pupil_pixel * k[n];
             for (int n = 0; n < 2; ++n) {
                 matrix[n] = (1.0f - k[0]) * of_voxel.unframe[n] - k[1] * of_voxel.unframe[2 + n];
@@ -125,7 +127,7 @@ struct Tile {
         const float pupil_pixel = voxel.pupil_pixel, rim = voxel.rim;
         const V none = {}, width = min(splat((float)BLOCK_WIDTH), group.columns - column0);
         const V u = group.u0 - (column0 + 0.5f * (width - 1.0f)) * pupil_pixel;
-        layer = edge_layer(group, here, u, width);
+        layer = voxel.in.profiles ? edge_layer(group, here, u, width) : none;
         const V near_u = max(abs(u) - 0.5f * pupil_pixel * width, none);
         const V square = rim * rim - near_u * near_u, half_height = sqrt(max(square, none));
         low = max(ceil((group.v0 - half_height) / pupil_pixel - 0.5f), none);
@@ -133,7 +135,7 @@ struct Tile {
         high = (here & (square >= 0.0f)) ? high : none - 1.0f;
     }
 
-    /// Return the layer of the microimage at the pupil's edge, from how the weights fall outwards there. Where only a
+    /// Return the layer of the microimage at the pupil's edge for profiles, from how the weights fall outwards there. Where only a
     /// part of a pixel lies inside the pupil, the weight that counts is that of the part's middle.
     LFPIV_INLINE static V edge_layer(const LensGroup& group, M here, V u, V width) {
         const LocalFrame<V>& local = group.local;
