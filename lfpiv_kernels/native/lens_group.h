@@ -135,7 +135,7 @@ struct Tile {
         high = (here & (square >= 0.0f)) ? high : none - 1.0f;
     }
 
-    /// Return the layer of the microimage at the pupil's edge for profiles, from how the weights fall outwards there. Where only a
+    /// Return the layer of the microimage at the pupil's edge, from how the profiles fall outwards there. Where only a
     /// part of a pixel lies inside the pupil, the weight that counts is that of the part's middle.
     LFPIV_INLINE static V edge_layer(const LensGroup& group, M here, V u, V width) {
         const LocalFrame<V>& local = group.local;

@@ -205,7 +205,7 @@ struct Voxel {
     }
 };
 
-/// The lenses that a voxel's rays can reach, from straight rays near its own over the whole pupil and bounds of the rest.
+/// The lenses that a voxel's rays can reach, from the nearest straight rays over the pupil and bounds of the rest.
 struct ReachedLenses {
     const Voxel& voxel;
     float slope[4];      // at the pupil's centre
@@ -238,7 +238,7 @@ struct ReachedLenses {
         next_i = i0, next_j = j0;
     }
 
-    /// Add to a slope the straight rays that are nearest to the third order `c` over the pupil. Return a bound of the rest.
+    /// Add to a slope the straight rays nearest to the third order `c` over the pupil. Return a bound of the rest.
     ///
     /// In polar coordinates, uuu is r^3 (3 cos + cos 3) / 4, uvv is r^3 (cos - cos 3) / 4, and so with sines. Over the
     /// unit disc r^3 departs from 3/4 r by 1/4 at most.
