@@ -57,21 +57,6 @@ def test_rays_and_voxels_get_the_light_of_the_weights(form, edge):
         tiled.rays.zero_()  # rays that no voxel lights are never written
 
 
-@pytest.mark.parametrize("edge", [20, 31])
-def test_projection_and_back_projection_are_adjoint(form, edge):
-    blocks, rng = random_blocks(form, edge, seed=2), np.random.default_rng(2)
-    tiled = TiledProjector(blocks)
-    volume, light = rng.random(VOXELS).astype(np.float32), rng.random(blocks.microimages.size).astype(np.float32)
-    tiled.scatter(to_device(volume, float), ALL)
-    forth = np.vdot(tiled.in_order(to_host(tiled.rays))[: len(light)].astype(float), light)
-    placed = np.zeros(len(tiled.rays), np.float32)
-    placed[tiled.places(np.arange(len(light)))] = light
-    tiled.rays.assign(placed)
-    back = to_device(np.zeros(VOXELS, np.float32), float)
-    tiled.gather(back, to_device(np.ones(VOXELS, np.float32), float), ALL)
-    assert np.vdot(to_host(back).astype(float), volume) == pytest.approx(forth, rel=TOLERANCE_ADJOINT)
-
-
 def test_sums_do_not_depend_on_the_run_and_lit_rays_are_counted(form):
     blocks = random_blocks(form, 20, seed=3)
     tiled, volume = TiledProjector(blocks), to_device(np.random.default_rng(3).random(VOXELS).astype(np.float32), float)

@@ -1,7 +1,5 @@
 """Sweeps over voxels, sums, quantiles and the first guess against NumPy, and their independence of the threads."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import warp as wp
@@ -88,19 +86,6 @@ def test_the_faintest_kept_voxel_is_that_of_the_sorted_light(volumes, share):
     least = np.searchsorted(below, share * below[-1] * (1 - TOLERANCE_SUM))
     most = min(np.searchsorted(below, share * below[-1] * (1 + TOLERANCE_SUM)), len(ordered) - 1)
     assert ordered[least] <= kept <= ordered[most] or kept == 0
-
-
-def test_sums_do_not_depend_on_the_threads(monkeypatch):
-    rng = np.random.default_rng(1)
-    weight, values = (to_device(rng.normal(size=2 * voxels.FEWEST_VOXELS + 3).astype(np.float32)) for _ in range(2))
-    device, found = runtime.device(), []
-    for threads in (1, 2, 5):
-        used = min(threads, device.threads)
-        monkeypatch.setattr(runtime, "device", lambda used=used: dataclasses.replace(device, threads=used))
-        totals = sums.Totals(1)
-        totals.add_squares(0, weight, values)
-        found.append(totals.read())
-    assert found[0] == found[1] == found[2]
 
 
 @pytest.mark.parametrize("momentum", [False, True])

@@ -112,26 +112,6 @@ def test_images_cut_off_at_0_are_prepared_as_those_that_are_not(weights, cap):
         assert one.camera_gain == signed[name].camera_gain
 
 
-@pytest.mark.slow
-def test_a_camera_s_brightness_is_part_of_its_gain(weights):
-    """Brightness and floor scale with it: the same as a camera of which the white image says so, in its own counts."""
-    images = recorded(weights, particles(weights.grid, 2), 2)
-    assert plain_steps.reconstruct(weights, images, 0).camera_gain == [1.0, 1.0]
-    gain = np.float32(image_preparation.GAIN_STEP**-6)
-    for name in images:
-        dim = images | {name: images[name] * gain}
-        found = plain_steps.reconstruct(weights, dim, 10)
-        assert dict(zip(images, found.camera_gain, strict=True)) == pytest.approx(
-            dict.fromkeys(images, 1.0) | {name: gain}
-        )
-        known = two_cameras()
-        known.cameras[name].gain *= gain
-        known = plain_steps.reconstruct(lfpiv.build_weights(known, weights.grid), dim, 10)
-        assert known.camera_gain == [1.0, 1.0]
-        assert np.abs(found.values - known.values).max() <= TOLERANCE_F32 * known.values.max()
-        assert np.diff(found.misfit).max() < 0
-
-
 @pytest.mark.parametrize("gain", [0.5, 0.25, 0.1])
 def test_cameras_of_unlike_brightness_are_nearly_as_good_as_like_ones(weights, gain):
     """With photon noise the dim one tells less; untold, its brightness would cost far more than its noise does."""

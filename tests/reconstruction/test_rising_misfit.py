@@ -1,7 +1,5 @@
 """An epoch of ordered subsets whose misfit rises is undone, safer steps follow, and the misfit falls."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from support import plain_steps
@@ -11,7 +9,6 @@ import lfpiv
 from lfpiv.reconstruction import momentum, ordered_subsets, steps
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import CameraEquation, ImageEquations, State
-from lfpiv_kernels import runtime
 from lfpiv_kernels.transfer import to_device, to_host
 
 TOLERANCE_LEAST = 1e-3  # a rise is seen an epoch late, where the next kind of steps is already slow
@@ -57,15 +54,6 @@ def test_a_rise_that_is_undone_is_no_stop_by_tolerance(oblique, monkeypatch):
     images = blobs(oblique, 60, 1)
     found, never = (misfit_of(oblique, images, 14, tolerance=value) for value in (5e-4, 0.0))
     assert (np.diff(never[1:12]) > 0).any() and found.tolist() == never.tolist()
-
-
-def test_a_rise_does_not_depend_on_the_threads(oblique, monkeypatch):
-    monkeypatch.setattr(steps, "BAND", NO_BAND)
-    images, device, keywords = blobs(oblique, 60, 1), runtime.device(), {"sieve_voxel": SIEVE, "subsets": 4}
-    before = plain_steps.reconstruct(oblique, images, 10, **keywords)
-    assert (np.diff(before.attrs["misfit"][1:8]) > 0).any()
-    monkeypatch.setattr(runtime, "device", lambda: dataclasses.replace(device, threads=1))
-    np.testing.assert_array_equal(plain_steps.reconstruct(oblique, images, 10, **keywords).values, before.values)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """SMART: convergence to the minimum of its divergence, its invariants, and a particle that comes back in its place."""
 
-import dataclasses
 import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -261,34 +260,6 @@ def test_threads_that_share_weights_take_turns():
     assert (
         plain_steps.reconstruct(weights, alone[0], 5).values.tobytes() == one.tobytes()
     )  # the refusal left nothing behind
-
-
-def test_threads_change_nothing(monkeypatch):
-    weights = random_system(8, rows=40)
-    images, _ = noisy_images(weights, 8)
-    many = plain_steps.reconstruct(weights, images, iterations=12)
-    single = dataclasses.replace(runtime.device(), threads=1)
-    monkeypatch.setattr(runtime, "device", lambda: single)
-    alone = plain_steps.reconstruct(weights, images, iterations=12)
-    assert alone.values.tobytes() == many.values.tobytes()
-    assert alone.misfit == many.misfit
-
-
-@pytest.mark.parametrize(
-    "keywords", [{}, {"accelerate": False}, {"sieve_voxel": 0.6}], ids=["momentum", "plain", "sieve"]
-)
-@pytest.mark.parametrize("seed", range(8))
-def test_misfit_never_rises_and_the_volume_stays_positive(seed, keywords):
-    weights = random_system(seed)
-    images, image = noisy_images(weights, seed)
-    volume = plain_steps.reconstruct(weights, images, iterations=60, floor=0.05, floor_share=0.0, **keywords)
-    misfit = np.array(volume.misfit)
-    assert (np.diff(misfit) <= TOLERANCE_MISFIT * image.sum()).all()
-    assert misfit[-1] < misfit[0]
-    assert (volume.values > 0).all()
-    assert len(volume.residual) == 61
-    own = divergence(matrix_of(weights), image, volume.values.ravel(), 0.05)
-    assert abs(misfit[-1] - own) <= TOLERANCE_F32 * own  # what is recorded is the misfit of what is returned
 
 
 @pytest.mark.parametrize("seed", range(4))

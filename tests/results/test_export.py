@@ -1,6 +1,5 @@
 """Exports, read back by the programs that they are made for."""
 
-import csv
 import json
 import logging
 import os
@@ -19,7 +18,6 @@ from lfpiv.results import export, netcdf
 
 NUMBERS = (0, 2, 3)
 SINGLE = 1e-6  # relative rounding of single precision, in which images are stored
-TEXT = 1e-8  # of numbers with nine digits
 INTERVAL_S = 0.25
 
 
@@ -104,34 +102,6 @@ def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     assert "volume_0003_b.vti" in listed and "volume_0001_b.vti" not in listed
     names = "pair_0001_a.nc, pair_0001_b.nc, pair_0002_a.nc, pair_0002_b.nc"
     assert f"{names}: left out, made with other settings" in caplog.text and "--keep-volumes" in caplog.text
-
-
-def test_one_netcdf_holds_all_pairs(run, tmp_path):
-    folder, _ = run
-    (path,) = lfpiv.export_results(folder, "netcdf", out=tmp_path, interval_s=INTERVAL_S)
-    with xr.open_dataset(path) as opened:
-        expected = lfpiv.open_results(folder)
-        xr.testing.assert_equal(opened.drop_vars("time").load(), expected.load())
-        assert opened.time.values.tolist() == [INTERVAL_S * number for number in NUMBERS]
-        assert opened.time.attrs["units"] == "s" and opened.u.attrs == expected.u.attrs
-        assert opened.attrs["dt_s"] == expected.attrs["dt_s"]
-
-
-def test_a_table_has_a_row_per_vector_and_units_in_its_header(run, tmp_path):
-    folder, written = run
-    paths = lfpiv.export_results(folder, "csv", out=tmp_path, pairs=(2, None))
-    assert [path.name for path in paths] == ["pair_0002.csv", "pair_0003.csv"]
-    with paths[0].open(newline="", encoding="utf-8") as file:
-        titles, *rows = csv.reader(file)
-    assert titles[:7] == ["x [mm]", "y [mm]", "z [mm]", "u [m/s]", "v [m/s]", "w [m/s]", "displacement_x [voxel]"]
-    assert {"valid", "peak_ratio", "uncertainty [voxel]"} <= set(titles)
-    assert len(rows) == written[2].u.size
-    for number in (0, 7, len(rows) - 1):
-        row = {title.split(" [")[0]: float(value or "nan") for title, value in zip(titles, rows[number], strict=True)}
-        place = np.unravel_index(number, written[2].u.shape)  # x varies fastest
-        vector = written[2].isel(dict(zip("zyx", map(int, place), strict=True)))
-        for name, value in row.items():
-            assert np.isclose(value, float(vector[name]), rtol=TEXT, equal_nan=True), name
 
 
 def test_planes_have_the_form_pivpy_reads(run, tmp_path):

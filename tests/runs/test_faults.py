@@ -20,7 +20,6 @@ from lfpiv import open_results
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.results.folder import Folder
-from lfpiv.runs import pipeline
 from lfpiv.runs.frame_light import frame_light
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,25 +69,6 @@ def whole(out):
     results = {"background.h5", "calibration.h5", "guard.json", "refinement.json", "summary.json", "report.html"}
     kept = {".record.json", "calibration_left.h5", "calibration_right.h5"}
     return left <= results | kept and not (out / ".shared").exists()
-
-
-@pytest.mark.slow
-def test_a_killed_run_goes_on_and_gives_the_same_numbers(small_run, tmp_path):
-    """Kill -9 with two workers at work: they die too, nothing is half-written, and one process does the rest."""
-    out = small_run.prepared(tmp_path / "out")
-    run = start("run", small_run.experiment, "--out", out, "--workers", 2)
-    wait_for(lambda: finished(out), run, "finished pair")
-    children = psutil.Process(run.pid).children(recursive=True)
-    run.kill()
-    run.communicate()
-    assert gone(children), "workers outlived their run"
-    before = {path: path.stat().st_mtime_ns for path in (out / "vectors").glob("pair_*.nc")}
-    assert 0 < len(before) < PAIRS and (out / ".shared").exists() and (out / ".lock").exists()
-    assert not (out / "summary.json").exists()
-    summary = pipeline.run(small_run.experiment, out)
-    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
-    assert all(path.stat().st_mtime_ns == time for path, time in before.items()), "a finished pair was done again"
-    assert len(summary["pairs"]) == PAIRS and summary["failed"] == []
 
 
 def dask(*arguments):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, two_cameras
+from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -205,18 +205,6 @@ def test_too_large_weights_are_refused_before_they_are_counted():
         count(rays=1024, limit_bytes=1000)
     with pytest.raises(ValueError, match=r"rays: expected a power of 2 from 16 to 131072, got 4093\."):
         count(rays=4093)
-
-
-def test_operator_is_adjoint_and_voxels_aside_have_no_weights():
-    weights = lfpiv.build_weights(two_cameras(), GRID, "count", rays=1024)
-    rng = np.random.default_rng(2)
-    volume = rng.random(GRID.shape).astype(np.float32)
-    images = {name: rng.random(c.optics.sensor_shape).astype(np.float32) for name, c in weights.cameras.items()}
-    forward = sum((own.astype(float) * images[name]).sum() for name, own in weights(volume).items())
-    assert forward == pytest.approx((weights.T(images).astype(float) * volume).sum(), rel=1e-5)  # float32 sums
-    assert weights.column_sum == pytest.approx(2.0, rel=0.02)  # rounded to levels
-    aside = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.0, 9.0, 0.0))
-    assert not lfpiv.build_weights(two_cameras(), aside, "count", rays=1024).column_sum.any()
 
 
 def test_the_setting_offers_what_the_kernel_can():

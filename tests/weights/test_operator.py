@@ -341,42 +341,6 @@ def small():
     return lfpiv.build_weights(rig, grid)
 
 
-def test_out_is_reused_and_results_do_not_depend_on_threads(small, monkeypatch):
-    volume = np.random.default_rng(5).random(small.grid.shape).astype(np.float32)
-    first = small(volume)
-    kept = {name: image.copy() for name, image in first.items()}
-    again = small(volume * 0, out=first)
-    assert all(again[name] is first[name] and not again[name].any() for name in first)
-    back = small.T(kept)
-    assert small.T(kept, out=np.empty_like(back)).tobytes() == back.tobytes()
-    single = replace(runtime.device(), threads=1)
-    monkeypatch.setattr(runtime, "device", lambda: single)
-    serial = small(volume)
-    assert all(serial[name].tobytes() == kept[name].tobytes() for name in kept)
-    assert small.T(kept).tobytes() == back.tobytes()
-
-
-def test_counted_operator_agrees_with_the_footprint(small):
-    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.3, 0.2, 0.2), voxel_mm=VOXEL_MM)
-    rig = IdealRig(small.cameras)
-    by_count, by_footprint = lfpiv.build_weights(rig, grid, "count", rays=131072), lfpiv.build_weights(rig, grid)
-    volume = np.random.default_rng(6).random(grid.shape).astype(np.float32)
-    counted_images, images = by_count(volume), by_footprint(volume)
-    for name, image in images.items():
-        # twelve voxels' footprint errors and counting noise partly average out
-        assert np.linalg.norm(image - counted_images[name]) <= FOOTPRINT_MEAN * np.linalg.norm(image)
-    unit = {name: np.ones(c.optics.sensor_shape, np.float32) for name, c in rig.cameras.items()}
-    ones = by_count.T(unit)
-    assert np.allclose(ones, by_footprint.T(unit), rtol=0.02)
-
-
-def test_a_voxel_outside_the_field_has_no_weights():
-    grid = lfpiv.Grid(shape=(1, 1, 2), voxel_mm=VOXEL_MM, first_centre_mm=(0.0, 9.0, 0.0))
-    weights = lfpiv.build_weights(two_cameras(), grid)
-    assert not any(image.any() for image in weights(np.ones(grid.shape)).values())
-    assert not weights.column_sum.any()
-
-
 @pytest.mark.parametrize("form", footprint.FORMS)
 def test_memory_estimate_tells_what_the_weights_themselves_take(form):
     """Rays, which do not depend on the grid, take the larger part of an estimate: without them."""

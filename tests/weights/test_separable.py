@@ -168,14 +168,6 @@ def test_sums_of_weights_are_those_of_footprints(both):
     assert np.abs(shared.affected_pixels[some] / lit[some] - 1).mean() < 0.03
 
 
-def test_operator_is_adjoint(both):
-    shared, rng = both[0], np.random.default_rng(2)
-    volume = rng.random(GRID.shape).astype(np.float32)
-    images = {name: rng.random(one.optics.sensor_shape).astype(np.float32) for name, one in shared.cameras.items()}
-    there = sum((shared(volume)[name].astype(float) * images[name]).sum() for name in images)
-    assert there == pytest.approx((shared.T(images).astype(float) * volume).sum(), rel=1e-5)
-
-
 def test_rows_of_pixels_see_all_of_the_light_once(both):
     shared = both[0]
     for name in shared.cameras:
