@@ -19,6 +19,7 @@ from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
 from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.particle_signal import EMPTY, NOISE
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
+from lfpiv.lightfield.tone_curve import CURVED, tone_exponent
 from lfpiv.warn import Code, Warning
 
 GAP_LIGHT = 0.1
@@ -217,7 +218,7 @@ def image_warnings(
     white_level: float | None = None,
     others: Mapping[str, LightFieldDecoder] | None = None,
 ) -> list[Warning]:
-    """Warn of misplaced or saturated light in one image.
+    """Warn of light in one image that is misplaced, saturated, or not proportional to the counts.
 
     Parameters
     ----------
@@ -244,6 +245,8 @@ def image_warnings(
         found.append(Warning(code=Code.MISPLACED, subject=subject, figures={"gap_light": between}))
     if (share := saturated_share(raw, white_level)) > SATURATED:
         found.append(Warning(code=Code.SATURATED, subject=subject, figures={"share": share}))
+    if (exponent := tone_exponent(raw)) > CURVED:
+        found.append(Warning(code=Code.TONE_CURVE, subject=subject, figures={"exponent": exponent}))
     return found
 
 

@@ -14,6 +14,7 @@ class Code(enum.Enum):
     OTHER_LATTICE = "other_lattice"
     MISPLACED = "misplaced"
     SATURATED = "saturated"
+    TONE_CURVE = "tone_curve"
     UNEVEN = "uneven"
     STANDING = "standing"
     COPIED = "copied"
@@ -101,6 +102,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.SATURATED: (
         "{share:percent} % of the bright pixels are saturated; clipped particles make ghosts, lower the laser's "
         "power or the camera's gain"
+    ),
+    Code.TONE_CURVE: (
+        "counts are not proportional to light: dark neighbouring counts lie apart as after a gamma curve of about "
+        "{exponent:.1f}. Record without gamma or another tone curve, or undo it before lfpiv reads the images"
     ),
     Code.UNEVEN: (
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "

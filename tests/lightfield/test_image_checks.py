@@ -144,6 +144,7 @@ def test_suspicious_images_are_found(pair_of_cameras):
     assert found(first) == found(second) == image_checks.uneven_warnings(first, second, "left") == []
     assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == [Code.SHIFTED]
     assert found(np.minimum(first * 40, 4095)) == [Code.SATURATED]
+    assert found(np.round(4095 * (first / 4095) ** (1 / 2.2))) == [Code.TONE_CURVE]
     assert [item.code for item in image_checks.uneven_warnings(first, second * 0.05, "left")] == [Code.UNEVEN]
     images = [(name, image_checks.fingerprint(image)) for name, image in (("one", first), ("other", second))]
     image_checks.require_different(images)
