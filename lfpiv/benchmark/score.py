@@ -17,6 +17,7 @@ from lfpiv.benchmark.sample import PairErrors, Sample, divergence, in_time, miss
 from lfpiv.benchmark.truth import PARTICLES, Truth, open_truth
 from lfpiv.benchmark.volumes import score_volumes
 from lfpiv.errors import InputError
+from lfpiv.experiment.pair_range import pair_range
 from lfpiv.files import plain
 from lfpiv.metrics import Estimate
 from lfpiv.progress import StepProgress
@@ -193,7 +194,7 @@ def chosen_numbers(truth: Truth, pairs: tuple[int, int | None] | None) -> tuple[
     InputError
         If there are none.
     """
-    first, last = pairs or (0, None)
+    first, last = pair_range(pairs)
     chosen = tuple(one for one in truth.numbers if one >= first and (last is None or one < last))
     if not chosen:
         raise InputError(

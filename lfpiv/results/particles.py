@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import DamagedFile, InputError
+from lfpiv.experiment.pair_range import pair_range
 from lfpiv.files import plain
 from lfpiv.geometry.names import PARTICLE
 from lfpiv.results import datasets, paraview
@@ -127,7 +128,7 @@ def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) ->
     InputError
         If there are none.
     """
-    first, last = (0, None) if pairs is None else pairs
+    first, last = pair_range(pairs)
     found = {}
     for path in sorted((folder / FOLDER).glob("*.nc")):
         match = NAME.fullmatch(path.name)

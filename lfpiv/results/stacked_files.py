@@ -17,6 +17,7 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
+from lfpiv.experiment.pair_range import pair_range
 from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, read_object
 from lfpiv.results import datasets, netcdf, provenance, stored_damping
@@ -193,7 +194,7 @@ def _listed(folder: Path, pairs: tuple[int, int | None] | None) -> tuple[str, ar
     if not vectors.is_dir():
         what = "no such folder" if not folder.exists() else "a file" if folder.is_file() else "no vectors in it"
         raise InputError(f"{folder}: expected the folder of a finished run (its --out), found {what}.")
-    start, stop = (0, None) if pairs is None else pairs
+    start, stop = pair_range(pairs)
     text = "" if pairs is None else f"{start}:{'' if stop is None else stop}"
     if start < 0 or (stop is not None and stop <= start):
         raise InputError(f"pairs: expected A:B with 0 <= A < B, found {text}.")

@@ -23,6 +23,7 @@ import xarray as xr
 
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile, InputError
+from lfpiv.experiment.pair_range import pair_range
 from lfpiv.files import replacing, replacing_folder
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
@@ -123,7 +124,7 @@ def _require_form(attributes: Mapping[str, Any], path: Path) -> None:
 
 
 def _chosen(results: xr.Dataset, dimension: str, pairs: tuple[int, int | None], path: Path) -> xr.Dataset:
-    start, stop = pairs
+    start, stop = pair_range(pairs)
     numbers = results[dimension].values
     which = np.flatnonzero((numbers >= start) & (numbers < (math.inf if stop is None else stop)))
     if not which.size:

@@ -21,6 +21,7 @@ from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment import recorded_times
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
+from lfpiv.experiment.pair_range import pair_range
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Layers
 from lfpiv.progress import Progress, StepProgress, ignore_progress
@@ -106,13 +107,13 @@ def open_run(
 
 def _select(experiment: Experiment, pairs: tuple[int, int | None] | None) -> range:
     known = experiment.numbers
-    start, stop = (None, None) if pairs is None else pairs
+    start, stop = pair_range(pairs)
     first, after = start or known.start, known.stop if stop is None else stop
     if not known.start <= first < after <= known.stop:
         numbers = "instants that have a partner" if experiment.recording.is_series else "pairs of the experiment"
         raise InputError(
             f"pairs: expected A:B with {known.start} <= A < B <= {known.stop}, the {numbers}, "
-            f"found {start or 0}:{'' if stop is None else stop}."
+            f"found {start}:{'' if stop is None else stop}."
         )
     return range(first, after)
 
