@@ -6,8 +6,6 @@ import io
 from pathlib import Path
 
 import matplotlib
-import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -46,25 +44,6 @@ def plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e6e9ec", linewidth=0.6)
     axes.set_axisbelow(True)
-
-
-def draw_slice(axes: Axes, volume: xr.DataArray, voxels: int, title: str) -> None:
-    """Draw a volume's brightest voxels in a slice about its middle y, x down and z to the right [mm]."""
-    middle = volume.sizes["y"] // 2
-    slab = volume.values[:, max(0, middle - voxels // 2) : middle + (voxels + 1) // 2].max(1)
-    z, x = volume["z"].values, volume["x"].values
-    half = (z[1] - z[0]) / 2
-    axes.imshow(
-        np.sqrt(slab.T / np.percentile(slab, 99.5)),
-        cmap="magma",
-        vmin=0,
-        vmax=1,
-        extent=(z[0] - half, z[-1] + half, x[-1] + half, x[0] - half),
-        aspect="equal",
-        interpolation="nearest",
-    )
-    axes.set(xlabel="z [mm]", ylabel="x [mm]")
-    axes.set_title(title, fontsize=9)
 
 
 def save(drawn: Figure, path: Path) -> None:

@@ -110,9 +110,7 @@ def run(
             checked = _check(current, pending, workers, scheduler)
         calibrated = replace(calibrated, calibration=prepared.board)
         done, weights = _process(current, prepared, checked, keep_volumes)
-        done, weights = _settle(current, prepared, done, weights)
-        done, weights = _follow(current, prepared, done, weights)
-        done = _bootstrap(current, prepared, done, weights)
+        done = _after_all(current, done, _Lazily(current, prepared, weights))
         summary = current.finish(calibrated, _with_reused(current, done, checked.pending, "vectors"), report=True)
         if not isinstance(experiment, Experiment):
             command: dict[str, Any] = {"experiment": str(experiment), "pairs": pairs, "device": device}
@@ -284,38 +282,21 @@ def _known(weights: Weights | None) -> _Weights:
     return lambda: weights
 
 
-def _settle(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
-    """Refuse pairs whose images do not belong together; return the invocation, and the weights if they were built."""
-    lazy = _Lazily(current, prepared, weights)
-    count = len(current.finished)
+def _after_all(current: Run, done: Invocation, lazy: _Lazily) -> Invocation:
+    """Do what follows the pairs; return the invocation, with the weights if they were built for it.
+
+    Refuse pairs whose images do not belong together. Make the tracks of a time series. Measure the damping by ghosts.
+    """
+    count, folder = len(current.finished), current.folder
     if done.weights is not None or count > current.earlier.settled:  # an earlier run may have ended before it settled
         current.settle(lazy.work)
         done = replace(done, settled=count)
-    return lazy.after(done), lazy.weights
-
-
-def _follow(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> tuple[Invocation, _Weights]:
-    """Make the tracks of a time series; return the invocation, and the weights if they were built for them."""
-    lazy = _Lazily(current, prepared, weights)
     pairs = current.pairs_with_particles() if current.experiment.recording.is_series else []
     pairs = [pair for pair in pairs if not (figures := current.finished.get(pair)) or figures.verdict not in REFUSED]
-    step = current.step(TRACKS)
-    tracks.decide(current.experiment, current.folder, current.tracks_stamp, pairs, lazy.work, step)
-    return lazy.after(done), lazy.weights
-
-
-def _bootstrap(current: Run, prepared: Prepared, done: Invocation, weights: _Weights) -> Invocation:
-    """Measure the damping by ghosts in simulated pairs; return the invocation with the weights built for them."""
-    lazy = _Lazily(current, prepared, weights)
-    bootstrap.decide(
-        current.experiment,
-        current.folder,
-        current.damping_stamp,
-        current.pairs_with_vectors,
-        lazy.work,
-        current.step(SIMULATED),
-    )
-    return lazy.after(done)
+    tracks.decide(current.experiment, folder, current.tracks_stamp, pairs, lazy.work, current.step(TRACKS))
+    stamp, finished = current.damping_stamp, current.pairs_with_vectors
+    bootstrap.decide(current.experiment, folder, stamp, finished, lazy.work, current.step(SIMULATED))
+    return done if lazy.built is None else replace(done, weights=lazy.built)
 
 
 @dataclass
@@ -334,10 +315,6 @@ class _Lazily:
             known, self.built = rig.build_weights(self.current, self.prepared, list(self.current.numbers[:1]))
             self.weights = _known(known)
         return rig.pair_work(self.current, known, keep_volumes=False, calibration=self.prepared.calibration)
-
-    def after(self, done: Invocation) -> Invocation:
-        """Return the invocation with the weights that were built."""
-        return done if self.built is None else replace(done, weights=self.built)
 
 
 def _with_reused(current: Run, done: Invocation, pending: PendingPairs, kind: str) -> Invocation:

@@ -216,18 +216,6 @@ def test_network_learns_the_rays_of_a_camera(angle, noise, goal):
     assert training.sigma_nor <= np.hypot(noise * np.sqrt(np.pi / 2) * 1.05, goal)
 
 
-@pytest.mark.slow
-def test_two_hidden_layers_beat_the_goal_too():
-    rng = np.random.default_rng(12)
-    points, pupil, array, dot = board_labels(aberrated, 4000, rng)
-    training = train(
-        np.hstack([points, pupil]), array, TrainingSettings(hidden=(12, 12), epochs=60), groups=dot, unit=PITCH
-    )
-    points, pupil = box(10_000, rng), disc(10_000, rng)
-    error = sigma_nor(training.network(np.hstack([points, pupil])), aberrated(points, pupil), PITCH)
-    assert error <= 2 * GOAL_NOISE_FREE  # with aberrations and a third of the paper's nodes
-
-
 def test_labels_count_by_their_standard_deviation():
     rng = np.random.default_rng(13)
     truth = thin_lens_model(OPTICS, 45.0)

@@ -39,13 +39,6 @@ def volume_of_blobs():
     return noisy_blobs(120)
 
 
-def test_subsets_partition_the_pixels_that_see_one_half(weights):
-    for name in weights.cameras:
-        even, odd, every = (set(weights.projector(name).see_only(part)) for part in (EVEN, ODD, ALL))
-        assert not even & odd and even | odd <= every
-        assert len(even | odd) > 0.9 * len(every)
-
-
 @pytest.mark.parametrize("cameras", [1, 3])
 @pytest.mark.parametrize(
     ("sets", "count"), [(1, 1), (2, 2), (3, 3), (5, 5), (8, 8), (13, 13), (64, 64), (16, 4), (13, 5), (7, 1)]

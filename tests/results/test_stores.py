@@ -92,12 +92,6 @@ def test_a_series_has_times_as_the_cf_conventions_want_them(tmp_path, form):
         lfpiv.export_results(tmp_path, form, interval_s=1.0)
 
 
-def test_a_store_of_pairs_has_times_if_the_interval_is_known(tmp_path, form):
-    write_run(tmp_path, NUMBERS)
-    (path,) = lfpiv.export_results(tmp_path, form, interval_s=0.25)
-    assert lfpiv.open_results(path).time.values.tolist() == [0.25 * number for number in NUMBERS]
-
-
 @pytest.mark.slow(but="pairs")
 def test_chunks_suit_a_point_and_a_field(run, form):
     (path,) = lfpiv.export_results(run, form)

@@ -20,7 +20,6 @@ from lfpiv.weights.storage import open_weights, save_weights
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.depth_planes import DepthPlanes
 from lfpiv_kernels.reconstruction.node_projector import NodeProjector
-from lfpiv_kernels.reconstruction.projector import EVEN, ODD
 
 TOLERANCE_TWIN = 2e-6  # float32 sums of up to 64 shares
 TOLERANCE_ADJOINT = 1e-5  # as of the operator
@@ -218,22 +217,6 @@ def test_operator_with_lines_of_sight_is_that_of_all_voxels(between):
     unit[13, 5, 9] = 1.0
     for name, image in nodes(unit).items():
         np.testing.assert_allclose(nodes.image(name, (13, 5, 9)), image, atol=1e-6 * image.max())
-
-
-def test_image_of_a_voxel_is_its_projection(both):
-    nodes, _ = both
-    unit = np.zeros(GRID.shape, np.float32)
-    unit[13, 5, 9] = 1.0
-    for name, image in nodes(unit).items():
-        np.testing.assert_allclose(nodes.image(name, (13, 5, 9)), image, atol=1e-6 * image.max())
-
-
-def test_halves_of_the_lenses_add_up(both):
-    projector = both[0].projector("cam1")
-    volume = np.random.default_rng(4).random(GRID.size).astype(np.float32)
-    pixels = np.empty(int(np.prod(projector.microimages.sensor_shape)), np.float32)
-    even, odd, every = (projector.project(volume, pixels.copy(), *part) for part in ((EVEN,), (ODD,), ()))
-    np.testing.assert_allclose(even + odd, every, atol=1e-5 * every.max())
 
 
 def test_voxels_without_part_do_not_change(both):
