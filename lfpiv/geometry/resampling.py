@@ -49,7 +49,8 @@ def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     Raises
     ------
     ValueError
-        If the volume is not finite or has no even coordinates.
+        If the volume is not finite or has no even coordinates, or is one of a joint fit and the voxels have another
+        size: `reconstruct_pair` takes the grid of such volumes.
 
     References
     ----------
@@ -72,6 +73,11 @@ def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     sampling = [matrix_of(given, grid, axis) for axis in range(3)]
     ratio, nearest = grid.voxel_mm / given.voxel_mm, grid.nearest_in(given)
     others = {str(name): about for name, about in volume.coords.items() if about.dims == AXES}
+    if any(about.attrs.get("units") == "voxel" for about in others.values()):
+        raise ValueError(
+            "volume: expected light alone on voxels of another size, found a volume of a joint fit, with its "
+            "displacement. Give the grid to `reconstruct_pair`."
+        )
     dark = others[MASKED].values[nearest].astype(bool) if MASKED in others else None
     coordinates: dict[str, Any] = dict(grid.coordinates())
     for name, about in others.items():

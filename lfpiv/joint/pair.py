@@ -205,6 +205,7 @@ def reconstruct_pair(
     floor: Sequence[float | Mapping[str, float] | None] = (None, None),
     correlation: Mapping[str, Any] | None = None,
     mask: Volume | Sequence[Volume] | None = None,
+    grid: Grid | None = None,
     progress: Callable[[float], None] | None = None,
     **smart: Any,
 ) -> list[xr.DataArray]:
@@ -228,6 +229,8 @@ def reconstruct_pair(
         without such a table.
     mask : ndarray or DataArray, shape (z, y, x), or a tuple or list of two, optional
         Voxels without fluid, as of `reconstruct`; of a body that moves, one mask for each frame.
+    grid : Grid, optional
+        Voxels of the returned volumes; default: those of the weights. See `volume_on`.
     progress : callable, optional
         Called with the finished fraction.
     **smart
@@ -251,4 +254,4 @@ def reconstruct_pair(
         raise ValueError("first: expected no first guess of a pair; use `reconstruct` for one.")
     solver = PairSolver(weights, SmartSettings(**smart), estimate=estimate, correlation=correlation)
     masks = mask if isinstance(mask, (tuple, list)) else (mask, mask)
-    return list(solver.solve(images, floor, progress, masks=masks).to_dataarrays())
+    return list(solver.solve(images, floor, progress, masks=masks).to_dataarrays(grid))

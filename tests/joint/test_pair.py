@@ -17,6 +17,8 @@ GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.2, 2.0
 WINDOWS = (16, 12, 12)
 CORRELATION = {"windows": WINDOWS}
 BLOB = 0.7
+BETWEEN_NODES_MM = 2e-3
+"""Largest error of a displacement that is interpolated linearly between voxels [mm]."""
 GAIN = 0.7
 """Largest share of the correlation's error that is left; 0.61 here, in a volume of few windows."""
 
@@ -86,6 +88,16 @@ def test_the_field_is_finer_than_its_vectors(pair, fitted):
     assert np.linalg.norm(error, axis=-1).mean() < WIDENED * errors(vectors, pair[0]).mean()
     assert (error < 2 * stated[field.valid.values]).mean() > 0.9
     assert float(np.abs(field.divergence).mean()) < 0.5 * float(np.abs(field.vorticity_y).mean())
+
+
+def test_volumes_of_a_joint_fit_come_on_other_voxels_by_the_grid(weights, pair, fitted):
+    """A displacement is no light: it is not resampled as such, and its unit is the edge of the new voxels."""
+    larger = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.25, 2.0, 1.75), voxel_mm=0.125)
+    with pytest.raises(ValueError, match=r"found a volume of a joint fit.* Give the grid to `reconstruct_pair`"):
+        lfpiv.volume_on(fitted[0][0], larger)
+    first = lfpiv.reconstruct_pair(weights, pair[1], estimate="joint", sieve_voxel=0.7, grid=larger)[0]
+    moved, known = first[MOVED["x"]], fitted[0][0][MOVED["x"]].interp_like(first, kwargs={"fill_value": None})
+    np.testing.assert_allclose(moved.values * larger.voxel_mm, known.values * GRID.voxel_mm, atol=BETWEEN_NODES_MM)
 
 
 def test_a_displacement_that_the_frames_contradict_is_not_taken(fitted):
