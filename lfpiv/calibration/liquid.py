@@ -22,10 +22,10 @@ UNEXPLAINED_PITCH = 0.1
 """Median residual of the thin lens above which a surface is looked for [microlens pitch]."""
 EXPLAINED = 0.05
 """Largest residual behind the surface, relative to the thin lens in air, if the surface explains the labels."""
-FIRST_INDEX, FIRST_HEIGHT_MM = 1.2, 20.0
+FIRST_INDEX, FIRST_HEIGHT_MM = 1.33, 60.0
 """Refractive index, and height of the surface above the board, from which the fit starts."""
-LEAST_INDEX = 1.05
-"""Least refractive index of a liquid."""
+LEAST_INDEX, MOST_INDEX = 1.05, 1.8
+"""Least and largest refractive index of a liquid: planes stated too far apart in water look as in 2.3."""
 CLEAR = 0.5
 """Least height of the surface above the dots, relative to their depth: a wrong stage looks like a surface on them."""
 TILT = 0.03
@@ -92,7 +92,7 @@ def liquid_surface(dots: BoardDots, lens: ThinLensModel, optics: Optics) -> Liqu
     seen = replace(surface(found), residual_pitch=residual)
     clear = seen.height_mm - top > CLEAR * float(np.ptp(points[:, 2]))
     explains = residual <= min(UNEXPLAINED_PITCH, EXPLAINED * limit)
-    return seen if explains and clear and seen.index >= LEAST_INDEX else None
+    return seen if explains and clear and LEAST_INDEX <= seen.index <= MOST_INDEX else None
 
 
 def median_distance(residual: np.ndarray) -> float:

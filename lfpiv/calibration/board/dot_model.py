@@ -109,8 +109,7 @@ class LensIntegral:
     def pixel_terms(self, pupil_mm: np.ndarray) -> np.ndarray:
         """Return the terms of the ray model in the mean over the rays of each pixel, shape (n, TERMS + bends).
 
-        A pixel and its blur are taken as a Gaussian of their variance, cut off by the edge of the pupil. Where rays are
-        bent to third order at most, the terms belong to the pixel's middle.
+        A pixel and its blur are taken as a Gaussian of their variance, cut off by the edge of the pupil.
 
         Parameters
         ----------
@@ -119,8 +118,6 @@ class LensIntegral:
         """
         radius, order = self.optics.pupil_radius_mm, self.shared.order
         pupil = np.asarray(pupil_mm, float) / radius
-        if order == BEND_ORDERS[0]:
-            return ray_terms(pupil, 1.0, order)
         sigma = self.optics.pupil_pixel_mm / radius * np.sqrt(1 / 12 + self.shared.blur_px**2)
         distance = np.maximum(np.linalg.norm(pupil, axis=1), 1e-9)
         along = pupil / distance[:, None]
