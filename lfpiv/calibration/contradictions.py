@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely_mistake, mistakes, turn_deg
 from lfpiv.calibration.board.planes import Signals, board_images
-from lfpiv.calibration.liquid import liquid_surface
+from lfpiv.calibration.liquid import LiquidSurface, median_distance, mistake_in_liquid
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.experiment.axes import MIRRORED, UPSIDE_DOWN, names_of, stated_for
 from lfpiv.experiment.experiment import CameraSetup, Experiment
@@ -31,6 +32,8 @@ PUPIL_SCALE = 0.05
 """Difference of the fitted pupil scale from 1 above which depth and defocus of the dots may contradict each other."""
 FITTED_PITCH = 0.1
 """Median residual of the thin lens up to which its pupil contradicts nothing, as behind a liquid [microlens pitch]."""
+UNFITTED_PITCH = 1.0
+"""Median residual of the thin lens above which labels are doubtful whatever its pupil [microlens pitch]."""
 NEARER_DEG = 10.0
 """Angle by which the fitted pose must be nearer to a mirror image of the stated one than to itself [degree]."""
 OTHER_ARRAY = 0.5
@@ -38,19 +41,21 @@ OTHER_ARRAY = 0.5
 images belong to the other camera."""
 
 Decoders = Callable[[CameraSetup], LightFieldDecoder]
+Dots = Callable[[CameraSetup, Mistake], BoardDots | None]
+"""Measures the dots of a camera as they are if a mistake was made; None where it finds none."""
 
 
-def doubtful(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel) -> bool:
+def doubtful(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel, surface: LiquidSurface | None) -> bool:
     """Return whether the dots of a camera may contradict its stated orientation or the order of the planes.
 
     Likely mistakes are then tried, which takes seconds. So a right camera may be doubtful. A camera whose labels the
-    surface of a liquid explains is none.
+    `surface` of a liquid explains is none.
     """
     stated = setup.orientation
-    if stated is None or liquid_surface(dots, lens, setup.optics) is not None:
+    if stated is None or surface is not None:
         return False
-    misfit = np.median(np.linalg.norm(dots.array_mm - lens(dots.points_mm, dots.pupil_mm), axis=1))
-    if misfit > FITTED_PITCH * setup.optics.microlens_pitch_mm and abs(lens.pupil_scale - 1) > PUPIL_SCALE:
+    misfit = median_distance(dots.array_mm - lens(dots.points_mm, dots.pupil_mm)) / setup.optics.microlens_pitch_mm
+    if misfit > UNFITTED_PITCH or (misfit > FITTED_PITCH and abs(lens.pupil_scale - 1) > PUPIL_SCALE):
         return True
     if dots.found.sum() < COMPLETE * dots.expected.sum():
         return True
@@ -73,10 +78,11 @@ def warn_unstated(experiment: Experiment) -> None:
         warn(log, Warning(code=Code.FLIP_UNSTATED, figures=figures))
 
 
-def cause(experiment: Experiment, decoder_of: Decoders, stretches: Sequence[float] = ()) -> str | None:
+def cause(experiment: Experiment, decoder_of: Decoders, dots_of: Dots, stretches: Sequence[float] = ()) -> str | None:
     """Name the mistake that explains all board images better than the stated rig, as a message; None without one.
 
-    A board with a mark names its dots by itself and is left out. `stretches` come from `likely_stretches`.
+    A board with a mark names its dots by itself and is left out. `stretches` come from `likely_stretches`. Behind a
+    liquid the labels of `dots_of` are judged.
     """
     if experiment.board.mark:
         return None
@@ -88,7 +94,9 @@ def cause(experiment: Experiment, decoder_of: Decoders, stretches: Sequence[floa
             continue
         decoders[setup.name] = decoder = decoder_of(setup)
         signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
-        mistake = likely_mistake(signals, decoder, board, setup.orientation, stretches=stretches)
+        tried = [*mistakes(setup.orientation, board.planes_mm), *(Mistake(stretch=one) for one in STRETCHES)]
+        wet = partial(mistake_in_liquid, partial(dots_of, setup), tried, setup.orientation, decoder.optics)
+        mistake = likely_mistake(signals, decoder, board, setup.orientation, stretches=stretches, in_liquid=wet)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake
     sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]

@@ -7,20 +7,23 @@ the surface: a thin lens, the height of the surface, its normal and the refracti
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration.board.dots import BoardDots
-from lfpiv.calibration.thin_lens_model import PRIOR, ThinLensModel, moved, robust_minimum
+from lfpiv.calibration.board.hypotheses import ALIKE_DEG, Mistake, turn_deg
+from lfpiv.calibration.thin_lens_model import PRIOR, ThinLensModel, fit_thin_lens, moved, robust_minimum
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 from lfpiv_kernels.rendering.real_optics import apparent_points, pack_plates
 
 SAMPLES = 400
 """Labels that the surface is fitted to."""
 UNEXPLAINED_PITCH = 0.1
 """Median residual of the thin lens above which a surface is looked for [microlens pitch]."""
-EXPLAINED = 0.05
+EXPLAINED = 0.08
 """Largest residual behind the surface, relative to the thin lens in air, if the surface explains the labels."""
 FIRST_INDEX, FIRST_HEIGHT_MM = 1.33, 60.0
 """Refractive index, and height of the surface above the board, from which the fit starts."""
@@ -93,6 +96,27 @@ def liquid_surface(dots: BoardDots, lens: ThinLensModel, optics: Optics) -> Liqu
     clear = seen.height_mm - top > CLEAR * float(np.ptp(points[:, 2]))
     explains = residual <= min(UNEXPLAINED_PITCH, EXPLAINED * limit)
     return seen if explains and clear and LEAST_INDEX <= seen.index <= MOST_INDEX else None
+
+
+def mistake_in_liquid(
+    dots_of: Callable[[Mistake], BoardDots | None], tried: Iterable[Mistake], stated: Orientation, optics: Optics
+) -> Mistake | None:
+    """Return the first mistake with which the surface of a liquid explains the dots of a camera; None without one.
+
+    `dots_of` measures the dots as they are if a mistake was made; None where it finds none.
+    """
+    for mistake in tried:
+        dots = dots_of(mistake)
+        if dots is None:
+            continue
+        try:
+            lens = fit_thin_lens(dots.points_mm, dots.pupil_mm, dots.array_mm, optics)
+        except ValueError:  # labels of a mirror image
+            continue
+        surface, rotation = liquid_surface(dots, lens, optics), mistake.orientation(stated).rotation
+        if surface is not None and turn_deg(surface.lens.rotation, rotation) < ALIKE_DEG:
+            return mistake
+    return None
 
 
 def median_distance(residual: np.ndarray) -> float:

@@ -16,8 +16,10 @@ import numpy as np
 from lfpiv.calibration import checks, contradictions
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
+from lfpiv.calibration.board.hypotheses import RIGHT, Mistake
 from lfpiv.calibration.board.planes import board_images
 from lfpiv.calibration.camera import CalibratedCamera
+from lfpiv.calibration.liquid import liquid_surface
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens
 from lfpiv.errors import InputError
@@ -112,18 +114,28 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
     checks.check_light(experiment, setup, sensor.decoder, images, dark)
 
+    known: BoardDots | None = None
+
+    def dots_of(one: CameraSetup, mistake: Mistake) -> BoardDots | None:
+        if one.name == setup.name and mistake == RIGHT:
+            return known
+        with contextlib.suppress(InputError):
+            decoder, own = decode(experiment, one).decoder, board_images(experiment, one.name)
+            return _measure_dots(experiment, one, decoder, own, mistake)
+        return None
+
     def cause(lens: ThinLensModel | None) -> str | None:
         with collected(quiet=True):
-            return contradictions.cause(
-                experiment, lambda one: decode(experiment, one).decoder, contradictions.likely_stretches(lens)
-            )
+            stretches = contradictions.likely_stretches(lens)
+            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder, dots_of, stretches)
 
     try:
-        dots = _measure_dots(experiment, setup, sensor.decoder, images)
+        dots = known = _measure_dots(experiment, setup, sensor.decoder, images)
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     except InputError as error:
         raise InputError(cause(None) or str(error)) from None
-    if contradictions.doubtful(setup, dots, lens) and (text := cause(lens)):
+    surface = liquid_surface(dots, lens, setup.optics)
+    if contradictions.doubtful(setup, dots, lens, surface) and (text := cause(lens)):
         raise InputError(text)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens)
@@ -160,17 +172,23 @@ def decode(experiment: Experiment, setup: CameraSetup) -> Sensor:
 
 
 def _measure_dots(
-    experiment: Experiment, setup: CameraSetup, decoder: LightFieldDecoder, images: Sequence[np.ndarray]
+    experiment: Experiment,
+    setup: CameraSetup,
+    decoder: LightFieldDecoder,
+    images: Sequence[np.ndarray],
+    mistake: Mistake = RIGHT,
 ) -> BoardDots:
-    board, dark = experiment.board, experiment.dark(setup.name)
+    """Measure the dots of a camera as they are if a mistake was made."""
+    board, dark = DotBoard.from_settings(experiment.board), experiment.dark(setup.name)
+    board = replace(board, planes_mm=mistake.depths_mm(board.planes_mm))
     place = f"{experiment.path}: board.images of camera {setup.name!r}"
     with input_errors(place):
         try:
             dots = measure_board(
                 images,
                 decoder,
-                DotBoard.from_settings(board),
-                orientation=setup.orientation,
+                board,
+                orientation=None if setup.orientation is None else mistake.orientation(setup.orientation),
                 estimator=experiment.network.estimator,
                 dark=dark,
             )

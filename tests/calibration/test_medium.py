@@ -12,9 +12,11 @@ from support.ideal_rig import optics
 
 import lfpiv
 from lfpiv.calibration import checks
-from lfpiv.calibration.liquid import liquid_surface
+from lfpiv.calibration.board.hypotheses import RIGHT, Mistake
+from lfpiv.calibration.liquid import liquid_surface, mistake_in_liquid
 from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
 from lfpiv.geometry.optics import random_on_pupil
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.simulation.scene import true_mapping
 from lfpiv.simulation.scene_camera import SceneCamera
 from lfpiv.simulation.simulator import simulate
@@ -77,28 +79,62 @@ def tank(index, height_mm=20.0):
     return {"window": (window | {"thickness_mm": 6.0, "index": 1.49, "medium_index": index},)}
 
 
-def surface_of(angle, window, depth=1.0):
-    """Look for a liquid's surface in labels of a board whose planes stand at `depth` times the stated depths."""
+def labels_of(angle, window, depth=1.0):
+    """Return labels and optics of a camera before a board whose planes stand at `depth` times the stated depths."""
     rng, count = np.random.default_rng(0), 20
     camera = SceneCamera.model_validate(scenes.camera("left", angle, (400, 400), true_pitch_deg=0.8, **window))
     points = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2, np.linspace(-0.8, 0.8, 5)), -1).reshape(-1, 3)
     points, radius = points.repeat(count, 0), camera.optics.pupil_radius_mm
     pupil = random_on_pupil(radius, len(points), rng)
     array = true_mapping(camera)(points * (1, 1, depth), pupil) + LABEL_MM * rng.standard_normal(pupil.shape)
-    lens = fit_thin_lens(points, pupil, array, camera.optics)
-    return liquid_surface(SimpleNamespace(points_mm=points, pupil_mm=pupil, array_mm=array), lens, camera.optics)
+    return SimpleNamespace(points_mm=points, pupil_mm=pupil, array_mm=array), camera.optics
 
 
-@pytest.mark.parametrize(("angle", "index"), [(-40.0, 1.333), (30.0, 1.333), (45.0, 1.5)])
-def test_the_surface_of_a_liquid_that_a_camera_looks_through_obliquely_explains_its_labels(angle, index):
-    surface = surface_of(angle, tank(index))
+def surface_of(angle, window, depth=1.0):
+    """Look for a liquid's surface in these labels."""
+    labels, optics = labels_of(angle, window, depth)
+    lens = fit_thin_lens(labels.points_mm, labels.pupil_mm, labels.array_mm, optics)
+    return liquid_surface(labels, lens, optics)
+
+
+@pytest.mark.parametrize(
+    ("angle", "index", "height_mm"),
+    [(-40.0, 1.333, 20.0), (30.0, 1.333, 20.0), (45.0, 1.5, 20.0), (-40.0, 1.333, 60.0), (-45.0, 1.5, 60.0)],
+)
+def test_the_surface_of_a_liquid_that_a_camera_looks_through_obliquely_explains_its_labels(angle, index, height_mm):
+    surface = surface_of(angle, tank(index, height_mm))
     assert surface.index == pytest.approx(index, abs=INDEX)
     assert surface.residual_pitch < 3 * LABEL_MM / OPTICS.microlens_pitch_mm
 
 
-@pytest.mark.parametrize(("window", "depth"), [({}, 1.0), ({}, 0.93), ({}, 0.5), ({}, 2.0), (tank(1.0), 1.0)])
+@pytest.mark.parametrize(
+    ("window", "depth"), [*(({}, depth) for depth in (1.0, 0.93, 0.5, 2.0, 10.0)), (tank(1.0), 1.0), (tank(1.333), 0.5)]
+)
 def test_no_liquid_is_found_in_air_whatever_the_scale_of_the_stage(window, depth):
     assert surface_of(-40.0, window, depth) is None
+
+
+@pytest.mark.parametrize("mistake", [Mistake(stretch=2.0), Mistake(left_right=True)])
+def test_the_mistake_with_which_a_liquid_explains_the_labels_is_found(mistake):
+    """Stated are half of the true depths, or the angle of a mirror image."""
+    stated = Orientation(40.0 if mistake.left_right else -40.0)
+
+    def dots_of(tried):
+        return labels_of(-40.0, tank(1.333), mistake.stretch / tried.stretch)[0]
+
+    tried = [RIGHT, Mistake(left_right=True), Mistake(stretch=0.5), Mistake(stretch=2.0)]
+    optics = labels_of(-40.0, tank(1.333))[1]
+    assert mistake_in_liquid(dots_of, tried, stated, optics) == mistake
+
+
+@pytest.mark.slow
+def test_pictures_that_are_mirrored_in_water_are_told_as_such(tmp_path):
+    camera = scenes.camera("only", -40.0, (420, 400), true_yaw_deg=-42.0, **tank(1.333))
+    more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
+    path = simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
+    path.write_text(path.read_text("utf-8").replace("nominal_angle_deg = -40", "nominal_angle_deg = 40"), "utf-8")
+    with pytest.raises(lfpiv.InputError, match=r"mirrored left to right.*Change the sign of nominal_angle_deg"):
+        lfpiv.calibrate(path)
 
 
 @pytest.mark.slow
@@ -107,7 +143,8 @@ def test_a_camera_that_looks_obliquely_into_water_is_calibrated(tmp_path):
     more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
     simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
     camera = lfpiv.calibrate(tmp_path / "experiment.toml").cameras["only"]
-    (medium,) = (warning for warning in camera.warnings if warning.code is Code.MEDIUM)
+    (medium,) = camera.warnings
+    assert medium.code is Code.MEDIUM
     assert medium.figures["index"] == pytest.approx(1.333, abs=INDEX)
     assert camera.report["dots_found"] == 5 * 25
     spec = json.loads((tmp_path / "truth" / "spec.json").read_text("utf-8"))["camera"][0]

@@ -7,7 +7,7 @@ planes, their contrast is high. The mistake with the clearly highest contrast fi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 
 CLEAR = 1.05
 """Least ratio of light by which a mistake must surpass what is stated."""
+SHARP = 0.5
+"""Least light by a mistake, relative to that of the dots as behind a liquid, with which the board is in air."""
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
 
@@ -44,6 +46,15 @@ class Mistake:
     def mirror(self) -> np.ndarray:
         """Matrix from the camera axes that are stated to those of the pictures, shape (3, 3)."""
         return np.diag([-1.0 if self.left_right else 1.0, -1.0 if self.up_down else 1.0, 1.0])
+
+    def orientation(self, stated: Orientation) -> Orientation:
+        """Return the orientation from which a camera would take the pictures, but for a mirror image of the board."""
+        yaw, pitch, roll = stated.yaw_deg, stated.pitch_deg, stated.roll_deg
+        return Orientation(
+            yaw_deg=-yaw if self.left_right else yaw,
+            pitch_deg=-pitch if self.up_down else pitch,
+            roll_deg=-roll if self.left_right != self.up_down else roll,
+        )
 
     def depths_mm(self, planes_mm: tuple[float, ...]) -> tuple[float, ...]:
         """Return the depths of the planes [mm]."""
@@ -78,13 +89,20 @@ def mistakes(orientation: Orientation, planes_mm: tuple[float, ...]) -> list[Mis
 
 
 def contrast(
-    signals: Signals, decoder: LightFieldDecoder, board: DotBoard, orientation: Orientation, mistake: Mistake
+    signals: Signals,
+    decoder: LightFieldDecoder,
+    board: DotBoard,
+    orientation: Orientation,
+    mistake: Mistake,
+    *,
+    in_liquid: bool = False,
 ) -> float:
     """Return the sum of the dots' contrasts in all planes if a mistake was made; 0 without a lattice."""
     board = replace(board, planes_mm=mistake.depths_mm(board.planes_mm))
     plan = CameraPose.from_plan(decoder.optics, orientation)
     plan = replace(plan, nominal_rotation=mistake.mirror @ plan.nominal_rotation)
-    rectify = rectifier(decoder, board)
+    plan = plan.behind_liquid if in_liquid else plan
+    rectify = rectifier(decoder, board, plan)
     start = first_lattice(signals, rectify, board, plan)
     if not start.regular:
         return 0.0
@@ -100,15 +118,19 @@ def likely_mistake(
     orientation: Orientation,
     *,
     stretches: Sequence[float] = (),
+    in_liquid: Callable[[], Mistake | None] = lambda: None,
 ) -> Mistake | None:
     """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly.
 
-    `stretches` are the depths of the planes over the stated ones that are tried.
+    `stretches` are the depths of the planes over the stated ones that are tried. Behind a liquid no mistake makes the
+    dots sharp, and `in_liquid` judges.
     """
     tried = mistakes(orientation, board.planes_mm)
     tried += [Mistake(stretch=stretch) for stretch in stretches]
     found = [contrast(signals, decoder, board, orientation, mistake) for mistake in tried]
     best = int(np.argmax(found))
+    if found[best] < SHARP * contrast(signals, decoder, board, orientation, RIGHT, in_liquid=True):
+        return in_liquid()
     if not found[best]:
         return None
     if best == 0:
