@@ -1,7 +1,7 @@
 """Plots of the page on accuracy, drawn from stored figures in the colours of the page, light or dark.
 
-`draw` needs no Sphinx; `setup` registers the directive ``{accuracy-plot} NAME``. `perf/accuracy/headlines.py`,
-`method_comparison.py` and `resolution.py` write the figures.
+`draw` needs no Sphinx; `setup` registers the directives ``{accuracy-plot} NAME`` and ``{lens-table}``. The figures are
+written by `perf/accuracy`: `headlines.py`, `method_comparison.py`, `resolution.py` and `lenses.py`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,15 @@ from lfpiv.report import svg
 
 FIGURES = METHODS.with_name("accuracy.json")
 RESOLUTION = METHODS.with_name("resolution.json")
+LENSES = METHODS.with_name("lenses.json")
+NAMES = {
+    "thin": "thin lens",
+    "double_gauss": "Double Gauss, f/4",
+    "cooke_triplet": "Cooke triplet, f/4",
+    "tessar": "Tessar, f/4.5",
+    "heliar": "Heliar, f/4.5",
+}
+"""Main lenses of `perf/accuracy/lenses.py`, in the order of the table."""
 OURS, TRUTH, BEFORE, PAPER = svg.SERIES[0], svg.INK, svg.SERIES[2], svg.SERIES[1]
 AXIS_COLOURS = dict(zip("xyz", svg.SERIES, strict=False))
 HEIGHT_INCH = 2.7
@@ -190,8 +199,31 @@ PLOTS = {
 """Plots by name."""
 
 
+def lens_table() -> str:
+    """Return the figures of each main lens as Markdown."""
+    rows = {row["lens"]: row for row in json.loads(LENSES.read_text("utf-8"))}
+    titles = ("lens", "mapping, 0.9 of the pupil", "whole pupil", "stated", "weights", "correlation", "joint fit")
+    lines = [titles, tuple("---" for _ in titles)]
+    for lens, name in NAMES.items():
+        row = rows[lens]
+        mapping = (f"{row['mapping'][part]:.4f}" for part in ("inner", "whole", "stated"))
+        moved = ("{:.3f} ± {:.3f}".format(*row["displacement"][way]) for way in ("correlation", "joint"))
+        lines.append((name, *mapping, f"{100 * row['weights']:.1f} %", *moved))
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
 def setup(app):
-    """Register the directive."""
+    """Register the directives."""
+    from sphinx.util.docutils import SphinxDirective
+
+    class LensTable(SphinxDirective):
+        """Figures of main lenses."""
+
+        def run(self):
+            self.env.note_dependency(str(LENSES))
+            return self.parse_text_to_nodes(lens_table())
+
+    app.add_directive("lens-table", LensTable)
     return add_directive(
         app, "accuracy-plot", lambda name: draw(name, stored_figures()), PLOTS, (FIGURES, METHODS, RESOLUTION)
     )

@@ -26,7 +26,6 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
-from lfpiv.calibration.liquid import liquid_surface
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
     Measured,
@@ -210,10 +209,9 @@ def _calibrate_camera(
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
     typical_pitch = float(np.median(np.linalg.norm(residual, axis=1))) / sensor.lattice.pitch_mm
-    surface = liquid_surface(dots, lens, setup.optics)
-    if surface is None:
+    if measured.surface is None:
         checks.check_pupil(experiment, setup, dots, lens, typical_pitch)
-    nominal = checks.compare_with_nominal(setup, lens, typical_pitch, surface)
+    nominal = checks.compare_with_nominal(setup, lens, typical_pitch, measured.surface)
     mapping = _fit_mapping(experiment, setup, dots, stated_mm, lens, residual, sensor.lattice.pitch_mm)
     step(0.9)
     rejected = dots.rejected + _disagreeing_per_plane(dots, mapping.agreeing, math.prod(experiment.board.dots))

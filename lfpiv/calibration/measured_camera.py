@@ -19,7 +19,7 @@ from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import RIGHT, Mistake
 from lfpiv.calibration.board.planes import board_images
 from lfpiv.calibration.camera import CalibratedCamera
-from lfpiv.calibration.liquid import liquid_surface
+from lfpiv.calibration.liquid import LiquidSurface, liquid_surface
 from lfpiv.calibration.quality import LensArrayQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens
 from lfpiv.errors import InputError
@@ -64,6 +64,8 @@ class Measured:
     """Labels, with the points of the board as stated."""
     lens: ThinLensModel
     """Thin lens fitted to them."""
+    surface: LiquidSurface | None
+    """Surface of a liquid, where it explains the labels and the thin lens does not."""
     warnings: tuple[Warning, ...] = ()
 
     def as_camera(self, setup: CameraSetup) -> CalibratedCamera:
@@ -86,7 +88,8 @@ class Measured:
         if lens is None or dots is None or quality is None or camera.network is not None:
             return None
         sensor = Sensor(lattice=camera.lattice, decoder=camera.decoder, quality=quality)
-        return cls(sensor=sensor, dots=dots, lens=lens, warnings=camera.warnings)
+        surface = liquid_surface(dots, lens, camera.optics)
+        return cls(sensor=sensor, dots=dots, lens=lens, surface=surface, warnings=camera.warnings)
 
 
 def measure_or_load(
@@ -138,7 +141,7 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     if contradictions.doubtful(setup, dots, lens, surface) and (text := cause(lens)):
         raise InputError(text)
     step(1.0)
-    return Measured(sensor=sensor, dots=dots, lens=lens)
+    return Measured(sensor=sensor, dots=dots, lens=lens, surface=surface)
 
 
 def fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> ThinLensModel:

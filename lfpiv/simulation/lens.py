@@ -78,6 +78,14 @@ PRESCRIPTIONS: dict[str, tuple[int, tuple[Row, ...]]] = {
             *((0.0, 0.1534, 1.0), (-7.5205, 0.09, 1.50137), (1.301, 0.3389, 1.62296), (-1.5218, 0.0, 1.0)),
         ),
     ),
+    "heliar": (  # Heliar f/5; M. Laikin, Lens Design, 4th ed., CRC Press, 2007, p. 63
+        5,
+        (
+            *((4.2103, 0.9004, 1.62041), (-3.6208, 0.2999, 1.53172), (29.1869, 0.7587, 1.0), (-3.1715, 0.2, 1.53172)),
+            *((3.2083, 0.1264, 1.0), (0.0, 0.2629, 1.0), (43.071, 0.25, 1.53172), (2.4494, 0.8308, 1.62041)),
+            (-3.2576, 0.0, 1.0),
+        ),
+    ),
 }
 """Published lenses: number of the stop, then radius, thickness [mm] and index behind each surface, for yellow light."""
 
@@ -85,7 +93,7 @@ PRESCRIPTIONS: dict[str, tuple[int, tuple[Row, ...]]] = {
 class Lens(Table):
     """Table ``[camera.lens]``: surfaces of the main lens, a published lens by its name, or a Zemax file."""
 
-    prescription: Literal["double_gauss", "cooke_triplet", "tessar"] | None = None
+    prescription: Literal["double_gauss", "cooke_triplet", "tessar", "heliar"] | None = None
     """A published lens."""
     surfaces: Annotated[tuple[LensSurface, ...], Field(max_length=bounds.MOST_SOLIDS)] = ()
     """Surfaces in the order in which light meets them, of any scale: they are scaled to ``focal_length_mm``."""

@@ -28,7 +28,7 @@ from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
 from lfpiv.simulation.simulator import simulate
 
-LENSES = {"thin": 4.0, "double_gauss": 4.0, "cooke_triplet": 4.0, "tessar": 4.5}
+LENSES = {"thin": 4.0, "double_gauss": 4.0, "cooke_triplet": 4.0, "tessar": 4.5, "heliar": 4.5}
 """f-number of each lens; a thin one is the simulator's ideal lens."""
 ANGLE_DEG, WINDOWS = 40.0, ((12, 16, 16), (12, 12, 12), (10, 10, 10))
 INNER, RAYS = 0.9, 20_000
