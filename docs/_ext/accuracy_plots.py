@@ -202,13 +202,21 @@ PLOTS = {
 def lens_table() -> str:
     """Return the figures of each main lens as Markdown."""
     rows = {row["lens"]: row for row in json.loads(LENSES.read_text("utf-8"))}
-    titles = ("lens", "mapping, 0.9 of the pupil", "whole pupil", "stated", "weights", "correlation", "joint fit")
+    titles = (
+        "lens",
+        "mapping, 0.9 of the pupil",
+        "whole pupil",
+        "stated",
+        "weights",
+        "pairs",
+        "correlation",
+        "joint fit",
+    )
     lines = [titles, tuple("---" for _ in titles)]
-    for lens, name in NAMES.items():
-        row = rows[lens]
+    for lens, row in sorted(rows.items(), key=lambda item: list(NAMES).index(item[0])):
         mapping = (f"{row['mapping'][part]:.4f}" for part in ("inner", "whole", "stated"))
         moved = ("{:.3f} ± {:.3f}".format(*row["displacement"][way]) for way in ("correlation", "joint"))
-        lines.append((name, *mapping, f"{100 * row['weights']:.1f} %", *moved))
+        lines.append((NAMES[lens], *mapping, f"{100 * row['weights']:.1f} %", str(row["pairs"]), *moved))
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
