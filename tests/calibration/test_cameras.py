@@ -168,7 +168,7 @@ def test_the_mistake_that_explains_the_board_is_named(rig, mistake):
     decoder = calibration.cameras["only"].decoder
     aperture = {"unit": 1.4, "depths": 0.4}.get(mistake, 1.0)  # as a camera fitted to wrong depths shows it
     stretches = contradictions.likely_stretches(SimpleNamespace(pupil_scale=aperture))
-    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, stretches))
+    assert re.search(MISTAKES[mistake], contradictions.cause(wrong, lambda setup: decoder, lambda *_: None, stretches))
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_what_is_right_has_no_mistake(rig):
     experiment, _, calibration = rig
     decoder = calibration.cameras["only"].decoder
     for stretches in ([], contradictions.likely_stretches(None)):
-        assert contradictions.cause(experiment, lambda setup: decoder, stretches) is None
+        assert contradictions.cause(experiment, lambda setup: decoder, lambda *_: None, stretches) is None
 
 
 def test_no_depths_are_doubted_where_the_dots_show_the_stated_aperture():

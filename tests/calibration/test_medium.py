@@ -133,7 +133,7 @@ def test_pictures_that_are_mirrored_in_water_are_told_as_such(tmp_path):
     more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
     path = simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
     path.write_text(path.read_text("utf-8").replace("nominal_angle_deg = -40", "nominal_angle_deg = 40"), "utf-8")
-    with pytest.raises(lfpiv.InputError, match=r"mirrored left to right.*Change the sign of nominal_angle_deg"):
+    with pytest.raises(lfpiv.InputError, match=r"mirrored left to right.*nominal_angle_deg has the wrong sign"):
         lfpiv.calibrate(path)
 
 
