@@ -99,7 +99,8 @@ class Tracking(Table):
     """Least light of a particle in each camera that counts, as a share of the typical particle's."""
     vectors: Literal["auto", "links", "correlation"] = "auto"
     """Whether a pair's vectors are means of its linked particles' flow, or come from correlation; "auto" takes links
-    where a single camera is used, which resolves depth worse by correlation."""
+    where a single camera is used, which resolves depth worse by correlation. State "links" for two and more cameras up
+    to 0.2 particles per microlens."""
 
     def gives_vectors(self, cameras: int) -> bool:
         """Return whether links give the vectors of a rig with a number of cameras."""

@@ -1,6 +1,6 @@
-"""Measure the vectors of linked particles beside the correlation's, with one camera.
+"""Measure the vectors of linked particles beside the correlation's.
 
-    python perf/accuracy/link_vectors.py --flows ring,swirl,turbulent --ppm 0.05,0.1 --seeds 1,2
+    python perf/accuracy/link_vectors.py --flows ring,swirl,turbulent --ppm 0.05,0.1 --seeds 1,2 --cameras 2
 
 `reconstruction_cases` has the cases. Errors are root mean squares along x, y, z over all vectors [voxel].
 """
@@ -67,11 +67,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ppm", default="0.05,0.1", help="particles per microlens")
     parser.add_argument("--seeds", default="1,2")
     parser.add_argument("--conditions", default="clean")
+    parser.add_argument("--cameras", type=int, default=1)
     parser.add_argument("--cache", type=Path, default=CACHE, help="folder of images")
     options = parser.parse_args(arguments)
     lists = (options.flows, options.conditions, options.ppm, options.seeds)
+    angles = ANGLES_DEG[options.cameras]
     for flow, condition, ppm, seed in product(*(text.split(",") for text in lists)):
-        case = Case(flow=flow, condition=condition, ppm=float(ppm), seed=int(seed), angles_deg=ANGLES_DEG[1])
+        case = Case(flow=flow, condition=condition, ppm=float(ppm), seed=int(seed), angles_deg=angles)
         for way, vectors in measure(case, options.cache).items():
             print(f"{flow} {condition} {ppm} {seed} {way:12s} {figures(case, vectors)}", flush=True)
     return 0
