@@ -109,23 +109,24 @@ def device(request):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_counted_voxel():
-    """Hold integrated weights against counted rays in one voxel per camera; return how many users have.
+def few_counted_voxels():
+    """Hold integrated weights against counted rays in two voxels per camera; return how many users have.
 
-    The count takes half of a small run. `tests/weights`, and tests with `whole_count`, compare all voxels.
+    The count takes half of a small run. By a single voxel other forms are chosen than users get.
+    `tests/weights`, and tests with `whole_count`, compare all voxels.
     """
     from lfpiv.weights import counting
 
     whole = counting.VOXELS
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counting, "VOXELS", 1)
+        patch.setattr(counting, "VOXELS", 2)
         yield whole
 
 
 @pytest.fixture
-def whole_count(one_counted_voxel, monkeypatch):
+def whole_count(few_counted_voxels, monkeypatch):
     """Compare as many voxels with counted rays as users do."""
-    monkeypatch.setattr("lfpiv.weights.counting.VOXELS", one_counted_voxel)
+    monkeypatch.setattr("lfpiv.weights.counting.VOXELS", few_counted_voxels)
 
 
 @pytest.fixture(scope="session")

@@ -90,10 +90,10 @@ from lfpiv.cli import commands
 from lfpiv.weights import counting
 
 lfpiv.report.write_report = lambda *given: given[-1].write_text("", "utf-8")
-counting.VOXELS = 1
+counting.VOXELS = 2
 commands.main()
 """
-"""The command line with an empty report and one counted voxel, as in tests that run in this process."""
+"""The command line with an empty report and two counted voxels, as in tests that run in this process."""
 
 
 def start(*arguments, **options) -> subprocess.Popen:
