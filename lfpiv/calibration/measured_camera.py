@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -119,18 +119,9 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
 
     known: BoardDots | None = None
 
-    def dots_of(one: CameraSetup, mistake: Mistake) -> BoardDots | None:
-        if one.name == setup.name and mistake == RIGHT:
-            return known
-        with contextlib.suppress(InputError):
-            decoder, own = decode(experiment, one).decoder, board_images(experiment, one.name)
-            return _measure_dots(experiment, one, decoder, own, mistake)
-        return None
-
     def cause(lens: ThinLensModel | None) -> str | None:
         with collected(quiet=True):
-            stretches = contradictions.likely_stretches(lens)
-            return contradictions.cause(experiment, lambda one: decode(experiment, one).decoder, dots_of, stretches)
+            return likely_cause(experiment, contradictions.likely_stretches(lens), {setup.name: known})
 
     try:
         dots = known = _measure_dots(experiment, setup, sensor.decoder, images)
@@ -142,6 +133,25 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
         raise InputError(text)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens, surface=surface)
+
+
+def likely_cause(
+    experiment: Experiment, stretches: Sequence[float], known: Mapping[str, BoardDots | None] | None = None
+) -> str | None:
+    """Name the mistake that explains all board images better than the stated rig; see `contradictions.cause`.
+
+    `known` has the dots of cameras that were measured as stated, None for dots that were not found.
+    """
+
+    def dots_of(setup: CameraSetup, mistake: Mistake) -> BoardDots | None:
+        if mistake == RIGHT and known is not None and setup.name in known:
+            return known[setup.name]
+        with contextlib.suppress(InputError):
+            decoder, own = decode(experiment, setup).decoder, board_images(experiment, setup.name)
+            return _measure_dots(experiment, setup, decoder, own, mistake)
+        return None
+
+    return contradictions.cause(experiment, lambda setup: decode(experiment, setup).decoder, dots_of, stretches)
 
 
 def fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> ThinLensModel:

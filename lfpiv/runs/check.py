@@ -14,7 +14,7 @@ from lfpiv.calibration.board.detect import planes_from_middle, rectifier
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.planes import Signals, board_images
 from lfpiv.calibration.board.pose import CameraPose
-from lfpiv.calibration.measured_camera import decode
+from lfpiv.calibration.measured_camera import decode, likely_cause
 from lfpiv.errors import InputError
 from lfpiv.experiment import axes
 from lfpiv.experiment.experiment import CameraSetup, Experiment
@@ -64,7 +64,7 @@ def check(experiment: Experiment | str | Path, out: str | Path, *, progress: Pro
             stretches = stretches if found else contradictions.likely_stretches(None)
             if progress is not None:
                 progress("board", (number + 1) / len(experiment.cameras))
-        contradiction = contradictions.cause(experiment, lambda setup: decode(experiment, setup).decoder, stretches)
+        contradiction = likely_cause(experiment, stretches)
     said = f"in the recorded pictures {axes.directions(experiment)}; {axes.handedness(experiment)}"
     picture = Path(out) / "check" / "board.png"
     with writing(picture):

@@ -247,8 +247,8 @@ struct ReachedLenses {
         const float once_u = 0.25f * (3.0f * c[0] + c[2]), once_v = 0.25f * (3.0f * c[3] + c[1]);
         const float thrice_u = 0.25f * (c[0] - c[2]), thrice_v = 0.25f * (c[1] - c[3]);
         out[0] = slope[0] + 0.75f * square * once_u, out[1] = slope[1] + 0.75f * square * once_v;
-        return square * radius * (0.25f * sqrt(once_u * once_u + once_v * once_v) +
-                                  sqrt(thrice_u * thrice_u + thrice_v * thrice_v));
+        return square * radius *
+               (0.25f * sqrt(once_u * once_u + once_v * once_v) + sqrt(thrice_u * thrice_u + thrice_v * thrice_v));
     }
 
     /// Find the range of lens indices, only as far as the sensor reaches and one microimage more.
