@@ -5,7 +5,7 @@ Main lenses, and how they bend rays
 Rays of one object point through published main lenses, traced exactly. An ideal lens sends them to one point of the
 array if it is in focus, and to places linear in the pupil point (u, v) if it is not. What a lens does beside that is
 drawn over its pupil, in microlens pitches: rays less the nearest polynomial of second order, which a dot of the board
-shows by itself, and less that of fifth order, which a calibration follows.
+shows by itself, and less the polynomial of fifth order, which a calibration follows.
 """
 
 import matplotlib.pyplot as plt

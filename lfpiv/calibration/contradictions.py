@@ -41,7 +41,7 @@ OTHER_ARRAY = 0.5
 images belong to the other camera."""
 
 Decoders = Callable[[CameraSetup], LightFieldDecoder]
-Dots = Callable[[CameraSetup, Mistake], BoardDots | None]
+Dots = Callable[[CameraSetup, LightFieldDecoder, Mistake], BoardDots | None]
 """Measures the dots of a camera as they are if a mistake was made; None where it finds none."""
 
 
@@ -95,7 +95,7 @@ def cause(experiment: Experiment, decoder_of: Decoders, dots_of: Dots, stretches
         decoders[setup.name] = decoder = decoder_of(setup)
         signals = Signals.from_images(board_images(experiment, setup.name), decoder, experiment.dark(setup.name))
         tried = [*mistakes(setup.orientation, board.planes_mm), *(Mistake(stretch=one) for one in STRETCHES)]
-        wet = partial(mistake_in_liquid, partial(dots_of, setup), tried, setup.orientation, decoder.optics)
+        wet = partial(mistake_in_liquid, partial(dots_of, setup, decoder), tried, setup.orientation, decoder.optics)
         mistake = likely_mistake(signals, decoder, board, setup.orientation, stretches=stretches, in_liquid=wet)
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake

@@ -140,15 +140,14 @@ def likely_cause(
 ) -> str | None:
     """Name the mistake that explains all board images better than the stated rig; see `contradictions.cause`.
 
-    `known` has the dots of cameras that were measured as stated, None for dots that were not found.
+    `known` has the dots of cameras that were measured as stated; None where they were not found.
     """
 
-    def dots_of(setup: CameraSetup, mistake: Mistake) -> BoardDots | None:
+    def dots_of(setup: CameraSetup, decoder: LightFieldDecoder, mistake: Mistake) -> BoardDots | None:
         if mistake == RIGHT and known is not None and setup.name in known:
             return known[setup.name]
         with contextlib.suppress(InputError):
-            decoder, own = decode(experiment, setup).decoder, board_images(experiment, setup.name)
-            return _measure_dots(experiment, setup, decoder, own, mistake)
+            return _measure_dots(experiment, setup, decoder, board_images(experiment, setup.name), mistake)
         return None
 
     return contradictions.cause(experiment, lambda setup: decode(experiment, setup).decoder, dots_of, stretches)

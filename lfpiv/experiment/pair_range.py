@@ -9,12 +9,17 @@ from lfpiv.errors import InputError
 
 
 def pair_range(pairs: Any) -> tuple[int, int | None]:
-    """Return the number of the first pair and the number after the last, None for the end; `pairs` None stands for all.
+    """Return the number of the first pair and the number after the last; None for the end.
+
+    Parameters
+    ----------
+    pairs : sequence of two, or None
+        Numbers that a caller gives; None stands for all pairs.
 
     Raises
     ------
     InputError
-        If `pairs` is anything else than two whole numbers of which the second may be None.
+        If `pairs` is neither None nor two whole numbers, of which the second may be None.
     """
     if pairs is None:
         return 0, None

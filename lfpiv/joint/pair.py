@@ -230,7 +230,7 @@ def reconstruct_pair(
     mask : ndarray or DataArray, shape (z, y, x), or a tuple or list of two, optional
         Voxels without fluid, as of `reconstruct`; of a body that moves, one mask for each frame.
     grid : Grid, optional
-        Voxels of the returned volumes; default: those of the weights. See `volume_on`.
+        Voxels of the returned volumes; default: the grid of the weights. See `volume_on`.
     progress : callable, optional
         Called with the finished fraction.
     **smart

@@ -20,14 +20,17 @@ _SURE = 5.0  # least distance of the exponent from 1 [standard errors]
 
 
 def tone_exponent(image: np.ndarray) -> float:
-    """Return the exponent gamma of the curve between light and counts.
-
-    It is 1 where no curve shows, or where counts have fractions.
+    """Fit the exponent gamma of the curve between light and counts, ``I' ~ I**(1 / gamma)``.
 
     Parameters
     ----------
     image : ndarray, shape (rows, columns)
         Image as recorded [counts].
+
+    Returns
+    -------
+    float
+        1 where no curve shows, or where counts are no whole numbers from 0 to 65535.
     """
     whole = image.astype(np.int64)
     if whole.min() < 0 or whole.max() > _MOST or not np.array_equal(whole, image):

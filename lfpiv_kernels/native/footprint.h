@@ -356,8 +356,8 @@ struct LensTile {
         }
         return at;
     }
-    /// Return the levels of pixels of a column, y rows from the reference pixel. The weight of a pixel that the pupil's
-    /// edge cuts is that of the middle of its part inside.
+    /// Return the levels of pixels of a column, y rows from the reference pixel. A pixel that the pupil's edge cuts has
+    /// the weight at the middle of its part inside.
     LFPIV_INLINE V level_in(const Column& at, V y) const {
         V ds = at.s + y * (at.s_y + y * (at.s_yy + y * bend.s3[3]));
         V dt = at.t + y * (at.t_y + y * (at.t_yy + y * bend.t3[3]));

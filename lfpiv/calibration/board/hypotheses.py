@@ -22,7 +22,7 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 CLEAR = 1.05
 """Least ratio of light by which a mistake must surpass what is stated."""
 SHARP = 0.5
-"""Least light by a mistake, relative to that of the dots as behind a liquid, with which the board is in air."""
+"""Light of the best mistake in air over the light of the board behind a liquid, below which there is a liquid."""
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
 
@@ -118,12 +118,12 @@ def likely_mistake(
     orientation: Orientation,
     *,
     stretches: Sequence[float] = (),
-    in_liquid: Callable[[], Mistake | None] = lambda: None,
+    in_liquid: Callable[[], Mistake | None],
 ) -> Mistake | None:
     """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly.
 
     `stretches` are the depths of the planes over the stated ones that are tried. Behind a liquid no mistake makes the
-    dots sharp, and `in_liquid` judges.
+    dots sharp: `in_liquid` is called there, and its answer returned.
     """
     tried = mistakes(orientation, board.planes_mm)
     tried += [Mistake(stretch=stretch) for stretch in stretches]
