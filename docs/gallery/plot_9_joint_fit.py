@@ -31,9 +31,8 @@ images, floor = [one.images for one in light], [one.noise for one in light]
 # the means over the windows, and `joint_field` what lies between them.
 
 settings = {"floor": floor, "grid": experiment.grid, **rig.smart}
-volumes = {
-    way: lfpiv.reconstruct_pair(rig.weights, images, estimate=way, **settings) for way in ("correlation", "joint")
-}
+ways = ("correlation", "joint")
+volumes = {way: lfpiv.reconstruct_pair(rig.weights, images, estimate=way, **settings) for way in ways}
 windows = {"dt_s": experiment.dt_s, **rig.correlation}
 correlated = lfpiv.correlate(*volumes["correlation"], **windows)
 fitted = lfpiv.joint_vectors(volumes["joint"], **windows)
