@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.viewcode",
+    "sphinx.ext.githubpages",  # an empty file .nojekyll: hosts of code serve folders whose names begin with _
     "myst_parser",
     "numpydoc",
     "sphinx_gallery.gen_gallery",

@@ -63,7 +63,7 @@ MAY_IMPORT = {
     "damping": {"reconstruction", "weights", "calibration", "velocity"},
     "joint": {"sequence", "reconstruction", "weights", "velocity"},
     "selfcalibration": {"reconstruction", "weights", "calibration"},
-    "report": {"results", "calibration", "lightfield", "velocity", "experiment"},
+    "report": {"results", "calibration", "lightfield", "velocity", "experiment", "simulation"},
 }
 MAY_IMPORT["runs"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}
 MAY_IMPORT["planning"] = set(MAY_IMPORT) - GROUND - {"metrics", "simulation"}

@@ -10,6 +10,7 @@ import itertools
 import json
 import logging
 import re
+import runpy
 import shlex
 import shutil
 import sys
@@ -334,6 +335,19 @@ def test_links_lead_somewhere():
         path = page.parent / file if file else page
         assert path.exists() or any(path.parent.glob(path.name)), (page, target)
         assert not anchor or anchor in slugs(path), (page, target)
+
+
+def test_the_report_of_the_demonstration_lies_beside_the_start_page(tmp_path, monkeypatch):
+    builder, settings = extension("demonstration"), runpy.run_path(str(DOCS / "conf.py"))
+    assert [DOCS / folder for folder in settings["html_extra_path"]] == [builder.EXTRA]
+    monkeypatch.setattr(builder, "DEMO", tmp_path)
+    monkeypatch.setattr(builder, "EXTRA", tmp_path / "pages")
+    monkeypatch.setattr(builder, "compare_with_the_tutorial", lambda: None)  # needs a run; the build itself compares
+    builder.EXTRA.mkdir()
+    (tmp_path / "report.html").write_text("a report")
+    builder.prepare(None)
+    named = re.findall(r'<a href="([^"]+)"', (DOCS / "index.md").read_text("utf-8"))
+    assert named and {(builder.EXTRA / name).read_text("utf-8") for name in named} == {"a report"}
 
 
 def test_scripts_use_names_that_exist():

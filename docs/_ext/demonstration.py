@@ -26,7 +26,7 @@ def prepare(app):
             demo.run(DEMO.name)
         finally:
             os.chdir(here)
-    _compare_with_the_tutorial()
+    compare_with_the_tutorial()
     shutil.copy(DEMO / "report.html", EXTRA / "demo-report.html")
 
 
@@ -42,7 +42,7 @@ def _summary():
     }, scene
 
 
-def _compare_with_the_tutorial():
+def compare_with_the_tutorial():
     """Warn, which ends a build with -W, where the run is no longer the one that the tutorial describes."""
     import quoted
     from sphinx.util import logging as sphinx_logging

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from lfpiv.benchmark.plain_truth import WINDOW_VOXEL
 from lfpiv.errors import InputError
 from lfpiv.geometry.grid import Grid
-from lfpiv.simulation.flows import Tracers, average_truth, window_mean
-from lfpiv.simulation.scene import Scene
+from lfpiv.simulation.flows import average_truth, window_mean
+from lfpiv.simulation.scene import Scene, stored_scene
 
 ABOUT = "benchmark.json"
 """File in which a case of the benchmark says what it is."""
@@ -200,13 +199,10 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
                 "data set, or the one of its truth as --truth."
             )
     try:
-        scene = Scene.model_validate(json.loads(spec.read_text("utf-8")))
-        if isinstance(scene.flow, Tracers):  # an absolute path stays as it is
-            flow = scene.flow.model_copy(update={"file": str(place.absolute() / scene.flow.file)})
-            scene = scene.model_copy(update={"flow": flow})
+        scene = stored_scene(place)
         with np.load(particles, allow_pickle=False) as stored:
             numbers = tuple(sorted({_number(name) for name in stored.files if name.endswith("_displacement_mm")}))
-    except (ValidationError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{place}: expected the truth of a simulated data set, found it damaged ({text}).") from None
     if not numbers:

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.geometry.grid import AXES
 from lfpiv.progress import Progress, ignore_progress
+from lfpiv.report import flow, known_flow
 from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
 from lfpiv.runs import pipeline, unchanged
-from lfpiv.simulation.flows import window_mean
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.simulator import simulate
-from lfpiv.velocity.settings import CorrelationSettings
 from lfpiv_kernels import runtime
 
 log = logging.getLogger(__name__)
@@ -65,25 +63,20 @@ def run(out: str | Path, *, device: str | None = None, progress: Progress | None
 
 
 def compare_with_truth(scene: Scene, out: Path) -> dict[str, float]:
-    """Return the error of the first pair's interior vectors against the flow averaged over each window [voxel].
+    """Return the error of the first pair's inner vectors against the true flow, as in the report [voxel].
 
     Errors are NaN if there is no vector. ``vectors`` is the number of vectors, ``speed_m_per_s`` the median speed of
-    the valid ones.
+    the valid ones, ``voxel_m_per_s`` the velocity of one voxel.
     """
     vectors = netcdf.read_vectors(Folder(out).vectors(0))
     speed = np.linalg.norm([vectors[name].values[vectors["valid"].values] for name in "uvw"], axis=0)
-    voxel_mm = scene.volume.voxel_mm
-    window_mm = np.array(CorrelationSettings.of(vectors).windows[-1][::-1]) * voxel_mm
-    inner = vectors.isel({axis: slice(1, -1) for axis in AXES if vectors.sizes[axis] > 2})
-    z, y, x = np.meshgrid(*(inner[axis].values for axis in AXES), indexing="ij")
-    truth = window_mean(scene.flow_of(0), np.stack([x, y, z], axis=-1).reshape(-1, 3), tuple(window_mm)) / voxel_mm
-    measured = np.stack([inner[f"displacement_{axis}"].values.ravel() for axis in "xyz"], axis=1)
-    error = np.linalg.norm(measured - truth, axis=1)
-    error = error[np.isfinite(error)]
+    found = known_flow.compare(vectors, scene, 0)
+    error = found.length_voxel
     return {
         "mean_error_voxel": float(error.mean()) if error.size else float("nan"),
         "median_error_voxel": float(np.median(error)) if error.size else float("nan"),
-        "largest_displacement_voxel": float(np.linalg.norm(truth, axis=1).max()),
+        "largest_displacement_voxel": found.largest_voxel,
+        "voxel_m_per_s": flow.voxel_velocity(vectors),
         "vectors": vectors["valid"].size,
         "speed_m_per_s": float(np.median(speed)) if speed.size else float("nan"),
     }

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from lfpiv.errors import InputError, printable
 from lfpiv.progress import PROGRESS_FILE, Progress
-from lfpiv.quantities import duration
+from lfpiv.quantities import duration, quantity
 from lfpiv.warn import name_pairs
 
 if TYPE_CHECKING:
@@ -233,9 +233,13 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
     found, vectors = summary["demo"], out / "vectors"
     valid, speed = 100 * summary["valid_fraction"], found["speed_m_per_s"]
     error, largest = found["mean_error_voxel"], found["largest_displacement_voxel"]
+    error_speed, largest_speed = (quantity(size * found["voxel_m_per_s"], "m/s", 2) for size in (error, largest))
     total_s = summary["timings_s"]["total"]
     say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.0f} % valid, {speed:.1f} m/s in the median")
-    say(f"error     {error:.2f} voxel on average where the flow moves by up to {largest:.1f} voxel; {total_s:.0f} s")
+    say(
+        f"error     {error:.2f} voxel ({error_speed}) on average where the flow moves by up to {largest:.1f} voxel "
+        f"({largest_speed}); {total_s:.0f} s"
+    )
     say(f"look at   {out / 'report.html'} in a browser; the vectors are in {vectors}")
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lfpiv import files
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.report import background, markup, overview, pairs, raw_image, tracks, volumes
+from lfpiv.report import background, known_flow, markup, overview, pairs, raw_image, tracks, volumes
 from lfpiv.report import calibration as calibration_section
 from lfpiv.report import vectors as vector_section
 from lfpiv.report.summary import Summary
@@ -72,6 +72,7 @@ def write_report(
     every = pairs.section(figures.pairs, figures.failed, figures.finished_count, recording) if figures.pairs else ""
     raw = raw_image.figure(experiment, figures.pairs[0].number) if figures.pairs else ""
     sections = {
+        "truth": known_flow.section(experiment, vectors),
         "vectors": vector_section.section(vectors, recording, figures.damping),
         "volumes": volumes.section(figures.pairs, vectors, recording) if vectors else "",
         "pairs": every + tracks.section(figures.tracks, path.parent) if figures.pairs else "",

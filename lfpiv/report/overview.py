@@ -62,6 +62,7 @@ def _list(texts: Sequence[str]) -> str:
 def contents(sections: Mapping[str, str], noun: str = "pair") -> str:
     """Return links to the sections that are not empty."""
     names = {
+        "truth": "Truth",
         "vectors": "Flow",
         "volumes": "Volumes",
         "pairs": f"{noun.capitalize()}s",

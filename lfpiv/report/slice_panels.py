@@ -50,6 +50,9 @@ def slice_panel(
     place: int,
     quantity: str,
     overlay: Overlay,
+    *,
+    like: xr.Dataset | None = None,
+    title: str = "",
 ) -> str:
     """Draw one slice of a field.
 
@@ -67,14 +70,19 @@ def slice_panel(
         What the colours show.
     overlay : {"arrows", "streamlines", "none"}
         What is drawn over them.
+    like : Dataset, optional
+        Field whose scales of colours and arrows are used. Default: `fields`.
+    title : str
+        What stands before the place of the slice, in place of the scale of the arrows behind it.
     """
     across, up = IN_SLICE[normal]
-    good = fields["valid"].values & np.isfinite(fields["u"].values)
+    like = fields if like is None else like
+    good = like["valid"].values & np.isfinite(like["u"].values)
     slab = fields.isel({normal: place}).transpose(up, across)
     edges = [cell_edges(slab[axis].values) for axis in (across, up)]
     spans = [high - low for low, high in edges]
     figure, axes = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
-    low, high = limits(fields[quantity].values[good], kinds[quantity])
+    low, high = limits(like[quantity].values[good], kinds[quantity])
     shown = axes.imshow(
         _smooth(np.where(slab["masked"].values, np.nan, slab[quantity].values)),
         cmap="RdBu_r" if kinds[quantity].signed else "viridis",
@@ -84,21 +92,23 @@ def slice_panel(
         interpolation="none",
     )
     _hatch(axes, slab["masked"].values, edges)
-    title = f"{normal} = {float(slab[normal]):.2f} mm".replace("-", "−")
+    named = f"{title}, " if title else ""
+    title = f"{named}{normal} = {float(slab[normal]):.2f} mm".replace("-", "−")
     in_plane = [COMPONENTS[axis] for axis in (across, up)]
     if overlay == "arrows":
-        speed = np.hypot(*(fields[name].values for name in in_plane))[good]
+        speed = np.hypot(*(like[name].values for name in in_plane))[good]
         longest = float(np.percentile(speed, 99.5)) if speed.size else 0.0
-        title += _draw_arrows(axes, slab, (across, up), longest, kinds["speed"].unit)
+        scale = _draw_arrows(axes, slab, (across, up), longest, kinds["speed"].unit)
+        title += "" if named else scale
     elif overlay == "streamlines":
         _draw_streamlines(axes, slab, (across, up))
     axes.set(xlim=edges[0], ylim=edges[1])
     style(axes, title=title, xlabel=f"{across} [mm]", ylabel=f"{up} [mm]")
     spread_ticks(axes)
     colour_bar(figure, shown, axes, kinds[quantity].title, location="bottom")
-    alt = f"Slice at {normal} = {float(slab[normal]):.2f} mm: colour is {kinds[quantity].label}"
+    alt = f"{named}slice at {normal} = {float(slab[normal]):.2f} mm: colour is {kinds[quantity].label}"
     over = {"arrows": f", arrows are {' and '.join(in_plane)}", "streamlines": ", with streamlines", "none": ""}
-    return to_svg(figure, f"{alt}{over[overlay]}.")
+    return to_svg(figure, f"{alt[0].upper()}{alt[1:]}{over[overlay]}.")
 
 
 def _smooth(values: np.ndarray) -> np.ma.MaskedArray:

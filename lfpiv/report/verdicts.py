@@ -25,6 +25,13 @@ FEWEST_DOTS = 0.5
 """Share of the board's dots below which the calibration is bad."""
 
 
+EXPLAINED = (
+    "Look: the figure lies between good and bad, and vectors can be used; the part of this page on it says more. "
+    "Bad: find the cause before you use the vectors."
+)
+"""What the verdicts mean, below tiles that are not all good."""
+
+
 class Level(enum.Enum):
     """Verdict on a figure; the value is its CSS class."""
 
@@ -156,4 +163,6 @@ def cards(found: list[Tile]) -> str:
         f'<dd class="limits">{markup.escape(tile.limits)}</dd></div>'
         for tile in found
     )
-    return f'<dl class="cards">{boxes}</dl>'
+    if all(tile.level is Level.GOOD for tile in found):
+        return f'<dl class="cards">{boxes}</dl>'
+    return f'<dl class="cards">{boxes}</dl>' + markup.paragraph(EXPLAINED, "quiet")

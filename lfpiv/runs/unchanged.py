@@ -140,6 +140,7 @@ def program() -> str:
 def _read_files(experiment: Experiment) -> Iterator[Path]:
     """Yield the files that a run of an experiment reads, some of them more than once."""
     yield experiment.path
+    yield experiment.path.parent / "truth" / "spec.json"  # of a simulated experiment, for the report
     yield from experiment.mask_files(experiment.all_frames())
     yield from (image.file for image in experiment.calibration_images())
     for camera in experiment.cameras:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -322,6 +323,33 @@ def open_scene(path: str | Path) -> Scene:
         scene = scene.model_copy(update={"flow": flow})
     if any(camera.lens is not None and camera.lens.file is not None for camera in scene.camera):
         scene = scene.model_copy(update={"camera": tuple(_with_lens(path, camera) for camera in scene.camera)})
+    return scene
+
+
+def stored_scene(folder: str | Path) -> Scene:
+    """Read the scene that a simulated experiment keeps in its folder ``truth``.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder ``truth``. The path of a tracer file is relative to it.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    OSError
+        If there is no file ``spec.json``, or it cannot be read.
+    ValueError
+        If it is no scene.
+    """
+    folder = Path(folder)
+    scene = Scene.model_validate(json.loads((folder / "spec.json").read_text("utf-8")))
+    if isinstance(scene.flow, Tracers):  # an absolute path stays as it is
+        flow = scene.flow.model_copy(update={"file": str(folder.absolute() / scene.flow.file)})
+        scene = scene.model_copy(update={"flow": flow})
     return scene
 
 

@@ -204,6 +204,7 @@ def test_the_demonstration_ends_with_warnings_and_three_aligned_lines(tmp_path, 
         "mean_error_voxel": 0.234,
         "median_error_voxel": 0.2,
         "largest_displacement_voxel": 2.71,
+        "voxel_m_per_s": 10.0,
         "vectors": 1234,
         "speed_m_per_s": 2.66,
     }
@@ -213,7 +214,11 @@ def test_the_demonstration_ends_with_warnings_and_three_aligned_lines(tmp_path, 
     assert warning == "warning: camera left sleeps" and len(lines) == 3
     assert len({len(line) - len(line.split(maxsplit=1)[1]) for line in lines[:2]}) == 1
     assert all(word in lines[0] for word in ("1,234 vectors", "100 % valid", "2.7 m/s"))
-    assert "0.23 voxel" in lines[1] and "2.7 voxel" in lines[1] and str(tmp_path / "report.html") in lines[2]
+    assert (
+        "0.23 voxel (2.3 m/s)" in lines[1]
+        and "2.7 voxel (27 m/s)" in lines[1]
+        and str(tmp_path / "report.html") in lines[2]
+    )
 
 
 @pytest.mark.slow

@@ -121,8 +121,9 @@ def test_the_page_is_well_formed_and_whole(text):
     for _, attributes in page.elements:
         for key in ("src", "href"):
             assert re.match("data:|#", attributes.get(key, "#")), "the page refers to something outside itself"
-    # raw, board, cameras, volumes, slice, profile, depths, space, streams, vorticity, uncertainty, histograms, pairs
-    assert len(page.all("svg")) == 2 + 1 + 2 * 9 + 3 + 2 + 1 + 1 + 5 + 1 + 3 + 3 + 3 + 3 + 3
+    # truth, raw, board, cameras, volumes, slice, profile, depths, space, streams, vorticity, uncertainty,
+    # histograms, pairs
+    assert len(page.all("svg")) == 3 + 2 + 1 + 2 * 9 + 3 + 2 + 1 + 1 + 5 + 1 + 3 + 3 + 3 + 3 + 3
     assert "figure" not in page.open and len(page.all("figure")) == len(page.all("figcaption"))
 
 
@@ -420,7 +421,9 @@ def test_tiles_judge_the_figures_of_the_run(reported):
 
 
 def test_the_flow_comes_before_volumes_and_calibration_is_folded(text):
-    places = [text.index(f'<h2 id="{name}"') for name in ("warnings", "vectors", "volumes", "pairs", "calibration")]
+    places = [
+        text.index(f'<h2 id="{name}"') for name in ("warnings", "truth", "vectors", "volumes", "pairs", "calibration")
+    ]
     assert places == sorted(places) and text.index('class="cards"') < places[1]
     assert text.index('id="calibration-fold"') < text.index("Microlens array of left")
     assert "<details open" not in text and 'href="#top"' in text and "1e-0" not in Page(text).text["p"]

@@ -13,6 +13,7 @@ from lfpiv.experiment.experiment import Experiment
 from lfpiv.results import netcdf
 from lfpiv.simulation.simulator import simulate
 from lfpiv.velocity.cross_correlation import Verdict
+from lfpiv.velocity.settings import CorrelationSettings
 
 NAME = """Ring <b>&"1'</b>"""
 """Name of the experiment, with all characters that have a meaning in HTML."""
@@ -93,7 +94,12 @@ def field(pair: int, shape: tuple[int, int, int] = (5, 6, 7)) -> xr.Dataset:
     vectors = xr.Dataset(variables, {name: (name, axis, {"units": "mm"}) for name, axis in axes.items()})
     for name, unit in netcdf.VECTOR_UNITS.items():
         vectors[name].attrs["units"] = unit
-    return vectors.assign_attrs(dt_s=DT_S, voxel_mm=[VOXEL_MM] * 3, verdict=Verdict.GOOD.value)
+    settings = CorrelationSettings(
+        windows=((4, 4, 4),), overlap=0.5, max_displacement_voxel=None, smoothing_voxel=0.5, intensity_power=0.5
+    )
+    return vectors.assign_attrs(
+        settings=settings.to_json(), dt_s=DT_S, voxel_mm=[VOXEL_MM] * 3, verdict=Verdict.GOOD.value
+    )
 
 
 def reconstruction() -> xr.Dataset:
