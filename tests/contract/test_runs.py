@@ -62,7 +62,8 @@ def test_particles_of_pairs(run, stored, loops):
     assert particles.valid.sum() > 60
     moved = np.stack([particles[f"displacement_{axis}"].values[particles.valid.values] for axis in "xyz"], axis=-1)
     assert np.sqrt(((moved - DISPLACEMENT_VOXEL) ** 2).mean()) < PARTICLE
-    stored.check("run: particles", loops, {name: particles[name].values for name in ("x", "y", "z", "intensity")})
+    columns = {name: particles[name].values for name in ("x", "y", "z", "intensity")}
+    stored.check("run: particles", loops, columns, listed=True)
 
 
 def test_summary_and_report(run):
