@@ -48,6 +48,4 @@ def picture(plotter: Any, name: str, turned: Any = None) -> Any:
     """Show what a plotter draws; `turned` is called when it was turned by hand."""
     events = {"interactor_events": (f"{name}_events", ["Animation", "EndAnimation"])} if turned else {}
     events |= {"Animation": turned, "EndAnimation": turned} if turned else {}
-    return vtk.VtkRemoteView(
-        plotter.render_window, ref=name, interactive_ratio=0.7, interactive_quality=70, still_quality=95, **events
-    )
+    return vtk.VtkRemoteView(plotter.render_window, ref=name, interactive_ratio=1, **events)

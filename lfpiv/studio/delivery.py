@@ -14,6 +14,10 @@ from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 
 LEAST_PX = 10
 """Views of hidden tabs are smaller, and are not drawn."""
+MOVING_PX = 400_000
+"""Largest number of pixels of a picture while it is turned or a slider moves; at rest the view's own number."""
+QUALITY = {True: 70, False: 95}
+"""Quality of the JPEG of pictures that move, and of others."""
 
 
 def send_at_once(protocol: Any) -> None:
@@ -29,18 +33,38 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
     window = part.get_view(options["view"])
     columns, rows = (max(int(length), LEAST_PX) for length in options.get("size") or window.GetSize())
     turning = options["view"] in part.views_in_animations
-    drawn = (_changed(window), columns, rows)
+    moving = turning or getattr(window, "lfpiv_moving", False)
     reply = {"stale": False, "mtime": 1, "size": [columns, rows], "global_id": options["view"], "image": None}
-    if turning and getattr(window, "lfpiv_drawn", None) == drawn:
+    if turning and getattr(window, "lfpiv_drawn", None) == (_changed(window), columns, rows):
         return reply
     if tuple(window.GetSize()) != (columns, rows):
         window.SetSize(columns, rows)
         for renderer in window.GetRenderers():  # in a narrow view the sides stay in sight
             renderer.GetActiveCamera().SetUseHorizontalViewAngle(columns < rows)
-    window.Render()
-    window.lfpiv_drawn = drawn
-    picture = _encoded(window, int(options.get("quality", 95)))
+    picture = _drawn(window, min(1.0, (MOVING_PX / (columns * rows)) ** 0.5) if moving else 1.0, QUALITY[moving])
+    window.lfpiv_drawn = (_changed(window), columns, rows)
     return reply | {"image": picture, "memsize": len(picture)}
+
+
+def _drawn(window: Any, ratio: float, quality: int) -> bytes:
+    """Render a window at a part of its size, letters included, and return it as JPEG."""
+    size, letters = tuple(window.GetSize()), window.GetDPI()
+    props = [prop for renderer in window.GetRenderers() for prop in renderer.GetViewProps()]
+    axes = [(prop, prop.GetScreenSize()) for prop in props if prop.IsA("vtkCubeAxesActor")] if ratio < 1 else []
+
+    def resize(columns: int, rows: int, share: float) -> None:
+        window.SetSize(columns, rows)
+        window.SetDPI(round(share * letters))
+        for prop, height in axes:
+            prop.SetScreenSize(share * height)
+
+    if ratio < 1:
+        resize(*(max(round(ratio * length), LEAST_PX) for length in size), ratio)
+    window.Render()
+    picture = _encoded(window, quality)
+    if ratio < 1:
+        resize(*size, 1.0)
+    return picture
 
 
 def _changed(window: Any) -> int:

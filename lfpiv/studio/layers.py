@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyvista as pv
 import xarray as xr
+from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
 import lfpiv
 
@@ -79,7 +80,13 @@ def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.Pol
     for name in {field, colour}:
         if np.isnan(grid[name]).any():
             some[name] = np.nan_to_num(grid[name], nan=float(np.nanmin(grid[name], initial=0.0)))
-    return some.contour([level], scalars=field)
+    edges = vtkFlyingEdges3D()  # with normals, in a quarter of the time of `contour`
+    edges.SetInputData(some)
+    edges.SetInputArrayToProcess(0, 0, 0, 0, field)
+    edges.SetInterpolateAttributes(True)
+    edges.SetValue(0, level)
+    edges.Update()
+    return pv.wrap(edges.GetOutput())
 
 
 def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.PolyData:

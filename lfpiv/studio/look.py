@@ -109,10 +109,11 @@ class Picture:
             )  # fmt: skip
         self._layer(
             "surface", look.surface and (key, look.surface, look.level, shade),
-            lambda: layers.surface(grid, look.surface or "", look.level, look.colour), **paint, smooth_shading=True,
+            lambda: layers.surface(grid, look.surface or "", look.level, look.colour), **paint,
         )  # fmt: skip
         if "surface" in self.plotter.actors:
-            self.plotter.actors["surface"].prop.opacity = look.opacity
+            shown = self.plotter.actors["surface"].prop
+            shown.opacity, shown.interpolation = look.opacity, "Phong"
         self._layer(
             "arrows", look.arrows and (key, look.arrows, look.length, shade),
             lambda: layers.arrows(grid, look.arrows, look.length, False), **paint,

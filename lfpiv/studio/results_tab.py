@@ -19,6 +19,8 @@ from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
 COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
+REST_S = 0.25
+"""Time without a change after which a picture is drawn with all its pixels."""
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "oblique"}
 
 
@@ -33,6 +35,7 @@ class Results:
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
         self.cloud, self.cloud_of = {}, ("", None)  # type: tuple[dict[str, pv.PolyData], tuple[str, int | None]]
         self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
+        self.rest: asyncio.TimerHandle | None = None
         self.state.update(
             {
                 "r_moment": "0", "r_moments": [], "r_numbers": 0, "r_step": 0, "r_colour": "speed", "r_fields": [],
@@ -174,6 +177,16 @@ class Results:
 
     def _draw_requested(self) -> None:
         self.pending = False
+        if self.rest is not None:
+            self.rest.cancel()
+        self._draw_at_rest(moving=not self.state.r_playing)
+        if not self.state.r_playing:
+            self.rest = asyncio.get_running_loop().call_later(REST_S, self._draw_at_rest)
+
+    def _draw_at_rest(self, moving: bool = False) -> None:
+        """Draw in full, or faster with fewer pixels while something moves."""
+        for picture in self.pictures:
+            picture.plotter.render_window.lfpiv_moving = moving
         with self.state:
             self.session.guarded(self.draw)()
 

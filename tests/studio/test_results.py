@@ -4,7 +4,9 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from support.report_run import field
@@ -14,6 +16,9 @@ from lfpiv.results import netcdf
 
 SAME_PICTURE = 1.0
 """Largest mean difference of pictures by the same calls [grey level]: fonts may be a pixel apart."""
+
+SAME_GREY = 4.0
+"""The same for a picture with two thirds of the pixels: edges and letters are blurred."""
 
 VIEW = "#tab-results .lf-view img"
 """The picture in the tab of results."""
@@ -73,3 +78,33 @@ def test_the_page_shows_and_turns_results(results, browser):
         browser.find_element("id", "r-copy").click()
         script = until(lambda: "".join(one.get_property("value") for one in browser.find_elements("id", "r-script")))
         assert "slices=(" in script and "camera_position" in script
+
+
+def test_pictures_that_move_have_fewer_pixels_and_show_the_same():
+    import pyvista as pv
+
+    from lfpiv.studio import delivery, look
+
+    picture = look.Picture.empty((1000, 800))
+    picture.plotter.add_mesh(pv.Sphere(), color="red")
+    picture.plotter.show_bounds()
+    window, part = picture.plotter.render_window, SimpleNamespace(still_render=None, views_in_animations=[])
+    part.get_view = lambda name: window
+    delivery.send_at_once(SimpleNamespace(getLinkProtocols=lambda: [part]))
+
+    def asked():
+        image = part.still_render({"view": "1", "size": [1000, 800]})["image"]
+        return image and cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+
+    still = asked()
+    window.lfpiv_moving = True
+    moving = asked()
+    assert still.shape == (800, 1000, 3) and moving.shape[0] * moving.shape[1] <= 1.01 * delivery.MOVING_PX
+    assert tuple(window.GetSize()) == (1000, 800)  # what is taken along has all its pixels
+    assert np.abs(cv2.resize(moving, (1000, 800)).astype(int) - still).mean() < SAME_GREY
+    window.lfpiv_moving = False
+    assert np.array_equal(asked(), still)
+    part.views_in_animations.append("1")
+    assert asked() is None  # nothing changed since
+    picture.plotter.camera.Azimuth(20)
+    assert asked() is not None
