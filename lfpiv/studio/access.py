@@ -84,18 +84,12 @@ class Places:
 
     def folders(self) -> Iterator[Path]:
         """Yield given folders and those below, hidden ones left out, no link followed."""
-        todo, count = [(root, 0) for root in self.roots], 0
-        while todo and count < MOST_FOLDERS:
-            folder, depth = todo.pop(0)
-            yield folder
-            count += 1
-            if depth < DEEPEST:
-                try:
-                    with os.scandir(folder) as entries:
-                        inner = sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
-                except OSError:
-                    continue
-                todo += [(folder / name, depth + 1) for name in inner if not name.startswith(".")]
+        level, left = list(self.roots), MOST_FOLDERS
+        for _ in range(DEEPEST + 1):
+            yield from (level := level[:left])
+            left -= len(level)
+            inner = (path for folder in level for path in sorted(folder.glob("[!.]*/")))  # none where it may not look
+            level = [path for path in inner if path.is_dir() and not path.is_symlink()]
 
     def experiments(self) -> list[Path]:
         """Return the experiment files in the folders: TOML files with a table of cameras and one of a volume."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import trame_client.widgets.html as html
@@ -42,6 +43,24 @@ def button(label: str, click: Any, icon: str = "", **more: Any) -> None:
     """Show a button."""
     options = {"prepend_icon": icon} if icon else {}
     v3.VBtn(label, click=click, size="small", variant="tonal", **options, **more)
+
+
+def linked(pictures: Sequence[Any], name: str, titles: Mapping[str, str], also: Any = lambda: True) -> list[Any]:
+    """Show pictures beside each other, whose cameras are the same: title -> when it is seen.
+
+    When one is turned all are drawn anew if `also` says so.
+    """
+    views: list[Any] = []
+
+    def turned(*_: Any, **__: Any) -> None:
+        for view in views if also() else ():
+            view.update()
+
+    for number, (title, shown) in enumerate(titles.items()):
+        with html.Div(classes="lf-view", v_show=shown):
+            html.Div(title, classes="lf-name", id=f"{name}-{number}")
+            views.append(picture(pictures[number].plotter, f"{name}_{number}", turned))
+    return views
 
 
 def picture(plotter: Any, name: str, turned: Any = None) -> Any:

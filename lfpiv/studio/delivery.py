@@ -48,22 +48,20 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
 
 def _drawn(window: Any, ratio: float, quality: int) -> bytes:
     """Render a window at a part of its size, letters included, and return it as JPEG."""
+    if ratio == 1:
+        window.Render()
+        return _encoded(window, quality)
     size, letters = tuple(window.GetSize()), window.GetDPI()
     props = [prop for renderer in window.GetRenderers() for prop in renderer.GetViewProps()]
-    axes = [(prop, prop.GetScreenSize()) for prop in props if prop.IsA("vtkCubeAxesActor")] if ratio < 1 else []
-
-    def resize(columns: int, rows: int, share: float) -> None:
-        window.SetSize(columns, rows)
+    axes = [(prop, prop.GetScreenSize()) for prop in props if prop.IsA("vtkCubeAxesActor")]
+    for share in (ratio, 1.0):
+        window.SetSize(*(max(round(share * length), LEAST_PX) for length in size))
         window.SetDPI(round(share * letters))
         for prop, height in axes:
             prop.SetScreenSize(share * height)
-
-    if ratio < 1:
-        resize(*(max(round(ratio * length), LEAST_PX) for length in size), ratio)
-    window.Render()
-    picture = _encoded(window, quality)
-    if ratio < 1:
-        resize(*size, 1.0)
+        if share < 1:
+            window.Render()
+            picture = _encoded(window, quality)
     return picture
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -51,13 +52,10 @@ class Draft:
 
     def get(self, location: Sequence[int | str]) -> Any:
         """Return the value at a place, or None where there is none."""
-        value: Any = self.values
-        for part in location:
-            try:
-                value = value[part]
-            except (KeyError, IndexError, TypeError):
-                return None
-        return value
+        try:
+            return functools.reduce(operator.getitem, location, self.values)  # type: ignore[arg-type]
+        except (KeyError, IndexError, TypeError):
+            return None
 
     def set(self, location: Sequence[int | str], value: Any) -> None:
         """Replace a value, or remove the key for None. A missing table is added at the end of the file."""
@@ -95,29 +93,19 @@ class Draft:
     def add_solid(self, kind: str, where: dict[str, Any]) -> None:
         """Add a solid to the volume."""
         volume: Any = self.document["volume"]
-        if "solid" not in volume:
-            volume.add("solid", tomlkit.aot())
-        table = tomlkit.table()
-        for key, value in {"kind": kind, **where}.items():
-            table.add(key, value)
-        volume["solid"].append(table)
+        volume.setdefault("solid", tomlkit.aot()).append(tomlkit.item({"kind": kind, **where}))
 
     def remove(self, location: Sequence[int | str]) -> None:
         """Remove an entry of a list of tables, such as a camera or a solid."""
-        table: Any = self.document
-        for part in location[:-1]:
-            table = table[part]
-        del table[location[-1]]
+        document: Any = self.document
+        del functools.reduce(operator.getitem, location[:-1], document)[location[-1]]
 
     def add_camera(self) -> None:
         """Add a camera with the values of the last one, under another name."""
         cameras: Any = self.document["camera"]
-        copy = tomlkit.table()
         names = {camera["name"] for camera in cameras}
-        for key, value in cameras[-1].unwrap().items():
-            copy.add(key, value)
-        copy["name"] = next(name for n in range(1, 100) if (name := f"camera{n}") not in names)
-        cameras.append(copy)
+        name = next(name for n in range(1, 100) if (name := f"camera{n}") not in names)
+        cameras.append(tomlkit.item(cameras[-1].unwrap() | {"name": name}))
 
     def problems(self) -> dict[str, str]:
         """Return what is wrong at each place, by its dotted name; "" for the file as a whole."""

@@ -22,10 +22,10 @@ class Form:
 
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
+        self.state.update(dict.fromkeys(("x_diff", "x_open", "x_checked"), ""))
         self.state.update(
-            {"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_changed": False, "x_diff": "", "x_files": []}
+            {"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_files": [], "x_shown": [0], "x_changed": False}
         )
-        self.state.update({"x_open": "", "x_checked": "", "x_shown": [0]})
         self.state.change("x_open")(lambda x_open, **_: x_open and session.guarded(self._choose)(x_open))
         self.plain: set[str] = set()
         session.server.trigger("x_write")(session.guarded(self.write))
@@ -82,10 +82,7 @@ class Form:
         elif what == "remove":
             draft.remove(location_of(place))
         elif what == "table":
-            if draft.get((place,)) is None:
-                draft.set((place,), {})
-            else:
-                draft.set((place,), None)
+            draft.set((place,), {} if draft.get((place,)) is None else None)
         elif what == "undo":
             self.session.draft = Draft(draft.path)
         elif what == "save":

@@ -44,7 +44,6 @@ class Images:
         )  # fmt: skip
         change = self.state.change
         change("tab")(lambda **_: self._open())
-        change("i_camera")(lambda **_: self._list_names())
         change("i_camera", "i_name")(lambda **_: self._show())
         change("i_lattice", "i_dots", "i_pixels", "i_axes")(lambda **_: session.guarded(self._mark)())
         change("i_u", "i_v")(lambda **_: session.guarded(self._pupil)())
@@ -60,44 +59,31 @@ class Images:
         self._open()
 
     def _open(self) -> None:
-        if (
-            self.state.tab == "images"
-            and self.raw is None
-            and self.session.experiment is not None
-            and not self.state.i_busy
-        ):
+        wanted = self.state.tab == "images" and self.session.experiment is not None
+        if wanted and self.raw is None and not self.state.i_busy:
             self.session.start(self._open_aside())
 
     async def _open_aside(self) -> None:
         """Read the experiment beside the page."""
         session = self.session
-        with self.state:
-            self.state.i_busy = "reading the experiment"
-        try:
+        with session.busy("i_busy", "reading the experiment"):
             raw = RawImages(await session.aside(read_experiment, session.experiment), session.results)
-            with self.state:
-                self.raw = raw
-                self.state.i_cameras = [setup.name for setup in raw.experiment.cameras]
-                self.state.i_camera = self.state.i_cameras[0]
-                z, grid = float(raw.experiment.grid.centre_mm[2]), raw.experiment.grid
-                half = grid.shape[0] * grid.voxel_mm / 2
-                self.state.i_depth, self.state.i_z = [z - half, z + half], z
-        finally:
-            with self.state:
-                self.state.i_busy = ""
         with self.state:
-            self._list_names()
+            self.raw = raw
+            self.state.i_cameras = [setup.name for setup in raw.experiment.cameras]
+            self.state.i_camera = self.state.i_cameras[0]
+            z, grid = float(raw.experiment.grid.centre_mm[2]), raw.experiment.grid
+            half = grid.shape[0] * grid.voxel_mm / 2
+            self.state.i_depth, self.state.i_z = [z - half, z + half], z
             self._show()
 
-    def _list_names(self) -> None:
-        if self.raw is not None and self.state.i_camera:
-            self.state.i_names = self.raw.names(self.state.i_camera)
-            if self.state.i_name not in self.state.i_names:
-                self.state.i_name = self.state.i_names[0]
-
     def _show(self) -> None:
-        if self.raw is not None and self.state.i_name in self.state.i_names:
-            self.session.start(self._show_aside(self.raw, self.state.i_camera, self.state.i_name))
+        """List the images of the camera, and show the chosen one."""
+        raw, s = self.raw, self.state
+        if raw is not None and s.i_camera:
+            s.i_names = raw.names(s.i_camera)
+            s.i_name = s.i_name if s.i_name in s.i_names else s.i_names[0]
+            self.session.start(self._show_aside(raw, s.i_camera, s.i_name))
 
     async def _show_aside(self, raw: RawImages, camera: str, name: str) -> None:
         """Show an image at once, and what is seen in it as soon as the camera is decoded."""
@@ -113,15 +99,9 @@ class Images:
             self.state.i_low, self.state.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
             self.state.i_marks = []
             values, counts = charts.histogram(sample)
-            self.state.i_chart = charts.chart(
-                {"": (values, np.asarray(np.log10(1 + counts)))}, "counts", "log10(pixels)"
-            )
-            self.state.i_busy = "finding the microlenses"
-        try:
+            self.state.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
+        with session.busy("i_busy", "finding the microlenses"):
             await session.aside(raw.calibrated, camera)
-        finally:
-            with self.state:
-                self.state.i_busy = ""
         with self.state:
             self.state.i_radius = raw.calibrated(camera).optics.pupil_radius_mm
             self.state.i_source = "measured by the run" if raw.measured else "nominal, not calibrated yet"
@@ -142,9 +122,8 @@ class Images:
             centres = raw.lattice_px(camera)
             radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
             marks.append(mark("circles", LATTICE, centres, radius=float(radius)))
-            facts.append(
-                f"{len(centres):,} microimages on the lattice, {optics.microimage_pitch_px:.2f} px apart (stated)"
-            )
+            apart = f"{optics.microimage_pitch_px:.2f} px apart (stated)"
+            facts.append(f"{len(centres):,} microimages on the lattice, {apart}")
         found = raw.marked_pixels(camera, image)
         for kind, places in found.items():
             facts.append(f"{len(places):,} {kind} pixels")

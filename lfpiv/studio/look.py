@@ -14,6 +14,7 @@ from lfpiv.studio import layers
 
 BACKGROUND = {"light": "white", "dark": "#16191d"}
 INK = {"light": "#202327", "dark": "#e6e8ea"}
+VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "xy"}
 REPLACED = "#8a8f98"
 """Colour of vectors that are replaced."""
 SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
@@ -167,20 +168,20 @@ class Picture:
         )  # fmt: skip
         if plotter.scalar_bars:
             plotter.remove_scalar_bar(render=False)
-        scale = pv.Plane(i_resolution=1, j_resolution=1)
-        low, high = paint["clim"]
-        scale[paint["scalars"]] = np.linspace(low, high, scale.n_points)
-        actor = plotter.add_mesh(
-            scale, name="scale", scalars=paint["scalars"], cmap=paint["cmap"], clim=paint["clim"],
-            scalar_bar_args=bar, reset_camera=False, render=False,
-        )  # fmt: skip
-        actor.SetVisibility(False)
+        scale = pv.DataSetMapper()
+        scale.lookup_table = pv.LookupTable(paint["cmap"], scalar_range=paint["clim"])
+        plotter.add_scalar_bar(mapper=scale, render=False, **bar)
         if not self.placed:
-            plotter.camera_position = "xy"
-            plotter.camera.azimuth, plotter.camera.elevation = 25.0, 20.0
-            plotter.reset_camera(bounds=grid.bounds, render=False)
-            plotter.camera.zoom(0.85)
+            self.look_along("oblique", grid.bounds)
             self.placed = True
+
+    def look_along(self, view: str, bounds: Any) -> None:
+        """Look at a box along an axis, or obliquely."""
+        camera, self.plotter.camera_position = self.plotter.camera, VIEWS[view]
+        if view == "oblique":
+            camera.azimuth, camera.elevation = 25.0, 20.0
+        self.plotter.reset_camera(bounds=bounds, render=False)
+        camera.zoom(0.85)
 
     def image(self) -> np.ndarray:
         """Return the picture, shape (rows, columns, 3)."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
+import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ class Preview:
                 windows = tomlkit.parse(f"windows = {self.state.t_windows}").unwrap()["windows"]
             except Exception:
                 raise InputError("windows: expected a list such as [32, 16, 12], found other text.") from None
-            found["correlation"]["windows"] = tuple(tuple(one) if isinstance(one, list) else one for one in windows)
+            found["correlation"]["windows"] = windows
         return found
 
     def try_it(self) -> None:
@@ -122,23 +123,15 @@ class Preview:
 
     async def _try(self, changed: dict[str, Any]) -> None:
         session = self.session
-        with self.state:
-            self.state.t_busy = "measuring the pair"
-        try:
-            with tempfile.TemporaryDirectory(prefix="lfpiv-") as folder:
-                request = {
-                    "experiment": str(session.experiment), "results": str(session.results or ""), "changed": changed,
-                    "pair": int(self.state.t_pair), "coarser": float(self.state.t_coarser), "out": folder,
-                }  # fmt: skip
-                answer = await _ask([sys.executable, "-m", "lfpiv.studio.trial"], json.dumps(request))
-                if "error" in answer:
-                    raise InputError(answer["error"])
-                grid = layers.grid_of(
-                    lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze()
-                )
-        finally:
-            with self.state:
-                self.state.t_busy = ""
+        with session.busy("t_busy", "measuring the pair"), tempfile.TemporaryDirectory(prefix="lfpiv-") as folder:
+            request = {
+                "experiment": str(session.experiment), "results": str(session.results or ""), "changed": changed,
+                "pair": int(self.state.t_pair), "coarser": float(self.state.t_coarser), "out": folder,
+            }  # fmt: skip
+            answer = await self._ask(["-m", "lfpiv.studio.trial"], json.dumps(request))
+            if "error" in answer:
+                raise InputError(answer["error"])
+            grid = layers.grid_of(lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze())
         with self.state:
             self.grids = [self.grids[1] if self.grids[1] is not None else grid, grid]
             uncertain = f", uncertainty {answer['uncertainty']} voxel" if answer["uncertainty"] is not None else ""
@@ -172,7 +165,7 @@ class Preview:
             return
         for table, settings in self.changed().items():
             for name, value in settings.items():
-                draft.set((table, name), list(value) if isinstance(value, tuple) else value)
+                draft.set((table, name), value)
         self.session.told("draft")
         self.state.tab = "experiment"
 
@@ -182,27 +175,27 @@ class Preview:
             self.session.start(self._plan())
 
     async def _plan(self) -> None:
-        command = [sys.executable, "-m", "lfpiv", "plan", str(self.session.experiment), "--json", "--quiet"]
+        command = ["-m", "lfpiv", "plan", str(self.session.experiment), "--json", "--quiet"]
         if self.session.results is not None and self.session.results.is_dir():
             command += ["--out", str(self.session.results)]
+        with self.session.busy("t_busy", "doing the first pair, whose times are scaled"):
+            answer = await self._ask(command, "")
         with self.state:
-            self.state.t_busy = "doing the first pair, whose times are scaled"
-        try:
-            answer = await _ask(command, "")
-        finally:
-            with self.state:
-                self.state.t_busy = ""
-        with self.state:
-            times, memory = answer["time"], answer["memory_bytes"]
-            durations = {
-                name.removesuffix("_s"): value for name, value in times.items() if isinstance(value, int | float)
-            }
-            needs = {name: value for name, value in memory.items() if value}
+            times = {name: value for name, value in answer["time"].items() if isinstance(value, int | float)}
+            memory = {name.replace("_", " "): value for name, value in answer["memory_bytes"].items() if value}
             self.state.t_plan = [
-                *(f"{name.replace('_', ' ')}: {duration(value)}" for name, value in durations.items()),
-                *(f"memory, {name.replace('_', ' ')}: {value / 2**20:,.0f} MiB" for name, value in needs.items()),
+                *(f"{name.removesuffix('_s').replace('_', ' ')}: {duration(value)}" for name, value in times.items()),
+                *(f"memory, {name}: {value / 2**20:,.0f} MiB" for name, value in memory.items()),
                 *answer["limits"],
             ]
+
+    async def _ask(self, arguments: list[str], text: str) -> dict[str, Any]:
+        """Call Python with arguments, and a text as its standard input; return the JSON on its standard output."""
+        run = partial(subprocess.run, [sys.executable, *arguments], input=text, capture_output=True, text=True)
+        done = await self.session.aside(run)
+        if done.returncode or "{" not in done.stdout:
+            raise InputError((done.stderr.splitlines() or [f"{arguments[1]}: ended without an answer."])[-1])
+        return dict(json.loads(done.stdout[done.stdout.index("{") :]))
 
     def _panel(self) -> None:
         guarded = self.session.guarded
@@ -234,25 +227,5 @@ class Preview:
                 controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01)
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
             with html.Div(classes="lf-main lf-double"), html.Div(classes="lf-views"):
-                self.views = tuple(self._view(number, name) for number, name in enumerate(("before", "after")))
-
-    def _view(self, number: int, name: str) -> Any:
-        with html.Div(classes="lf-view"):
-            html.Div(f"{name}: {{{{ t_{name} || 'nothing yet' }}}}", classes="lf-name", id=f"t-{name}")
-            return controls.picture(self.pictures[number].plotter, f"preview_{number}", self._linked)
-
-    def _linked(self, *_: Any, **__: Any) -> None:
-        for view in self.views:
-            view.update()
-
-
-async def _ask(command: list[str], text: str) -> dict[str, Any]:
-    """Run a command that answers with JSON on its standard output."""
-    pipe = asyncio.subprocess.PIPE
-    process = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
-    out, problem = await process.communicate(text.encode())
-    start = out.find(b"{")
-    if process.returncode or start < 0:
-        lines = problem.decode(errors="replace").strip().splitlines()
-        raise InputError(lines[-1] if lines else f"{command[3]}: ended without an answer.")
-    return dict(json.loads(out[start:]))
+                names = [f"{name}: {{{{ t_{name} || 'nothing yet' }}}}" for name in ("before", "after")]
+                self.views = controls.linked(self.pictures, "preview", dict.fromkeys(names, "true"))

@@ -6,7 +6,9 @@ Overlays are in pixels (column, row) of the recorded picture, before `image_flip
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,33 +57,27 @@ class RawImages:
     views: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     """Pupil views of the last images."""
 
-    def names(self, camera: str) -> list[str]:
-        """Return the names of a camera's images: white, dark, plane N, background F, and frames or instants."""
-        e = self.experiment
-        setup = e.camera(camera)
-        found = ["white", *(["dark"] if setup.dark_path else [])]
-        found += [f"plane {number}" for number in range(len(e.board.planes_mm))]
+    def _readers(self, camera: str) -> dict[str, Callable[[], np.ndarray | None]]:
+        """Return what reads each image of a camera: white, dark, plane N, background F, and frames or instants."""
+        e, setup = self.experiment, self.experiment.camera(camera)
+        found: dict[str, Callable[[], np.ndarray | None]] = {"white": partial(e.white, camera)}
+        if setup.dark_path:
+            found["dark"] = partial(e.dark, camera)
+        found |= {f"plane {plane}": partial(e.board_image, camera, plane) for plane in range(len(e.board.planes_mm))}
         if setup.background is not None:
-            found += [f"background {frame}" for frame in e.laser_names]
-        frames = e.recording.frames[:MOST_LISTED]
-        return found + [e.recording.frame(number).label for number in frames]
+            found |= {f"background {frame}": partial(e.background_image, camera, frame) for frame in e.laser_names}
+        frames = map(e.recording.frame, e.recording.frames[:MOST_LISTED])
+        return found | {frame.label: partial(e.frame_image, camera, frame) for frame in frames}
+
+    def names(self, camera: str) -> list[str]:
+        """Return the names of a camera's images."""
+        return list(self._readers(camera))
 
     def read(self, camera: str, name: str) -> np.ndarray:
         """Return an image as lfpiv reads it, float32 (rows, columns) [counts]."""
-        e, (kind, *rest) = self.experiment, name.split(" ", 2)
-        if name not in self.names(camera):
+        image = self._readers(camera).get(name, lambda: None)()
+        if image is None:
             raise InputError(f"{name}: expected an image of camera {camera!r}, found no such image.")
-        if kind in ("white", "dark"):
-            image = e.white(camera) if kind == "white" else e.dark(camera)
-        elif kind == "plane":
-            image = e.board_image(camera, int(rest[0]))
-        elif kind == "background":
-            image = e.background_image(camera, rest[0])
-        else:
-            numbers = e.recording.frames[:MOST_LISTED]
-            frame = next(frame for frame in map(e.recording.frame, numbers) if frame.label == name)
-            image = e.frame_image(camera, frame)
-        assert image is not None
         return image
 
     def calibrated(self, camera: str) -> CalibratedCamera:
@@ -121,12 +117,14 @@ class RawImages:
     def lattice_px(self, camera: str) -> np.ndarray:
         """Return the centres of the microimages where the lattice has them, shape (lens, 2)."""
         found = self.calibrated(camera)
-        index = self.lens_grid(camera).reshape(-1, 2)
-        optics = found.optics
-        centres = optics.sensor_px(found.lattice.centres_mm(index) * (1 + optics.sensor_per_pupil))
-        rows, columns = optics.sensor_shape
-        inside = ((centres > -0.5) & (centres < (columns - 0.5, rows - 0.5))).all(1)
-        return self.recorded_px(camera, centres[inside])
+        centres = self._light_px(camera, found.lattice.centres_mm(self.lens_grid(camera).reshape(-1, 2)))
+        rows, columns = found.optics.sensor_shape
+        return centres[((centres > -0.5) & (centres < (columns - 0.5, rows - 0.5))).all(1)]
+
+    def _light_px(self, camera: str, array_mm: np.ndarray) -> np.ndarray:
+        """Return where light that meets the array (n, 2) [mm] through the middle of the pupil lies [pixel]."""
+        optics = self.calibrated(camera).optics
+        return self.recorded_px(camera, optics.sensor_px(array_mm * (1 + optics.sensor_per_pupil)))
 
     def marked_pixels(self, camera: str, image: np.ndarray) -> dict[str, np.ndarray]:
         """Return saturated and hot pixels of an image as it is read, each (n, 2) in the recorded picture."""
@@ -154,28 +152,23 @@ class RawImages:
         """
         found, board = self.calibrated(camera), DotBoard.from_settings(self.experiment.board)
         numbers = plane * board.size + np.flatnonzero(board.occupied)
-        middle = np.zeros((len(numbers), 2))
-        chief = found.map(board.of_dots_mm(numbers), middle)
-        scale = 1 + found.optics.sensor_per_pupil
-        places = found.optics.sensor_px(chief * scale)
+        places = self._light_px(camera, found.map(board.of_dots_mm(numbers), np.zeros((len(numbers), 2))))
         across = self.experiment.board.dots[0]
         names = [f"{number % board.size % across},{number % board.size // across}" for number in numbers]
         arrows = np.zeros((0, 4))
         if found.dots is not None:
             here = np.isin(found.dots.measured_dot, numbers)
             rank = np.searchsorted(numbers, found.dots.measured_dot[here])
-            seen = found.optics.sensor_px(found.dots.chief_mm[here] * scale)
-            ends = places[rank] + ARROW_GAIN * (seen - places[rank])
-            arrows = np.hstack([self.recorded_px(camera, places[rank]), self.recorded_px(camera, ends)])
-        return self.recorded_px(camera, places), names, arrows
+            seen = self._light_px(camera, found.dots.chief_mm[here])
+            arrows = np.hstack([places[rank], places[rank] + ARROW_GAIN * (seen - places[rank])])
+        return places, names, arrows
 
     def axes_px(self, camera: str) -> np.ndarray:
         """Return where the volume's centre and steps along x and y from it lie, shape (3, 2) [pixel]."""
         found, grid = self.calibrated(camera), self.experiment.grid
         reach = 0.3 * min(n * grid.voxel_mm for n in grid.shape[1:])
         points = grid.centre_mm + reach * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        chief = found.map(points, np.zeros((3, 2)))
-        return self.recorded_px(camera, found.optics.sensor_px(chief * (1 + found.optics.sensor_per_pupil)))
+        return self._light_px(camera, found.map(points, np.zeros((3, 2))))
 
     def pupil_at(self, camera: str, place: tuple[float, float]) -> tuple[float, float]:
         """Return the pupil point (u, v) that a pixel of the recorded picture sees [mm]."""
@@ -221,9 +214,8 @@ class RawImages:
             known = np.isfinite(value)
             total[known] += value[known]
             seen += known
-        return (
-            np.divide(total, seen, out=np.zeros_like(total), where=seen > 0).reshape(len(y), len(x)).astype(np.float32)
-        )
+        mean = np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)
+        return mean.reshape(len(y), len(x)).astype(np.float32)
 
     def _stack(self, camera: str, name: str, pupil: np.ndarray) -> np.ndarray:
         """Return the pupil views of an image, shape (point, i, j); the last images' views are kept."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,11 @@ from lfpiv.studio.session import Session
 COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
 REST_S = 0.25
 """Time without a change after which a picture is drawn with all its pixels."""
-VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "oblique"}
+TURNS = {
+    "left": (-15.0, 0.0, 1.0), "right": (15.0, 0.0, 1.0), "up": (0.0, 15.0, 1.0), "down": (0.0, -15.0, 1.0),
+    "closer": (0.0, 0.0, 1.2), "farther": (0.0, 0.0, 1 / 1.2),
+}  # fmt: skip
+"""Name of a step -> angles to the right and up [degree], and zoom."""
 
 
 class Results:
@@ -29,11 +34,10 @@ class Results:
 
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
-        self.data: dict[str, xr.Dataset] = {}
-        self.grids: dict[tuple[str, str], pv.ImageData] = {}
+        self.open, self.grid = lru_cache(2)(self._results), lru_cache(40)(self._grid)
+        self.cloud = lru_cache(4)(self._cloud)
         self.pictures = (look.Picture.empty(), look.Picture.empty())
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
-        self.cloud, self.cloud_of = {}, ("", None)  # type: tuple[dict[str, pv.PolyData], tuple[str, int | None]]
         self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
         self.rest: asyncio.TimerHandle | None = None
         self.state.update(
@@ -63,63 +67,42 @@ class Results:
         """Open other results."""
         if what != "results":
             return
-        self.data.clear()
-        self.cloud_of = ("", None)
-        self.grids.clear()
+        for kept in (self.open, self.grid, self.cloud):
+            kept.cache_clear()
         self.charted = ()
-        places = self.session.places
-        folders = [str(path) for path in places.results()]
-        self.state.r_others = [{"title": "nothing", "value": ""}] + [
-            {"title": places.name(Path(path)), "value": path} for path in folders
-        ]
-        if self.session.results is None:
+        places, folder = self.session.places, self.session.results
+        others = [{"title": places.name(path), "value": str(path)} for path in places.results()]
+        self.state.r_others = [{"title": "nothing", "value": ""}, *others]
+        if folder is None:
             return
-        numbers = self.numbers(str(self.session.results))
-        statistics = [("mean", "mean of all"), ("fluctuations", "rms and stresses")] if len(numbers) > 1 else []
-        noun = "instant" if "instant" in self.open(str(self.session.results)).dims else "pair"
-        titles = [(str(number), f"{noun} {number}") for number in numbers]
-        self.state.r_moments = [{"title": title, "value": value} for value, title in titles + statistics]
-        self.state.r_numbers, self.state.r_step = len(numbers), 0
-        self.state.r_moment = str(numbers[0])
-        folder = self.session.results
-        kept = {"particles": folder / "particles", "tracks": folder / "tracks.nc"}
-        self.state.r_has = [name for name, path in kept.items() if path.exists()]
+        results = self.open(str(folder))
+        noun = "instant" if "instant" in results.dims else "pair"
+        titles = {str(number): f"{noun} {number}" for number in results[noun].values}
+        self.state.r_numbers, self.state.r_step, self.state.r_moment = len(titles), 0, next(iter(titles))
+        if len(titles) > 1:
+            titles |= {"mean": "mean of all", "fluctuations": "rms and stresses"}
+        self.state.r_moments = [{"title": title, "value": value} for value, title in titles.items()]
+        files = {"particles": folder / "particles", "tracks": folder / "tracks.nc"}
+        self.state.r_has = [name for name, path in files.items() if path.exists()]
         self._first_look()
         self.request()
 
-    def open(self, folder: str) -> xr.Dataset:
+    def _results(self, folder: str) -> xr.Dataset:
         """Return the vectors of a folder, which lies in those given."""
-        if folder not in self.data:
-            self.data[folder] = lfpiv.open_results(self.session.places.within(folder))
-        return self.data[folder]
+        return lfpiv.open_results(self.session.places.within(folder))
 
-    def numbers(self, folder: str) -> list[int]:
-        """Return the numbers of the pairs or instants of a folder."""
-        results = self.open(folder)
-        return [int(number) for number in results["instant" if "instant" in results.dims else "pair"].values]
+    def _grid(self, folder: str, moment: str) -> pv.ImageData:
+        """Return the fields of a moment as a grid."""
+        return layers.grid_of(layers.field_at(self.open(folder), moment))
 
-    def grid(self, folder: str, moment: str) -> pv.ImageData:
-        """Return the fields of a moment as a grid; the last ones are kept."""
-        key = (folder, moment)
-        if key not in self.grids:
-            while len(self.grids) > 40:
-                self.grids.pop(next(iter(self.grids)))
-            self.grids[key] = layers.grid_of(layers.field_at(self.open(folder), moment))
-        return self.grids[key]
-
-    def clouds(self, folder: str, moment: str) -> dict[str, pv.PolyData]:
-        """Return particles and tracks that are asked for; the last ones are kept."""
+    def _cloud(self, name: str, folder: str, moment: str) -> pv.PolyData | None:
+        """Return particles or tracks at a moment; None for particles of a statistic."""
         number = int(moment) if moment.isdigit() else None
-        wanted = [name for name in ("particles", "tracks") if self.state[f"r_{name}"]]
-        if self.cloud_of != (folder, number):
-            self.cloud_of, self.cloud = (folder, number), {}
-        for name in wanted:
-            if name == "tracks" and name not in self.cloud:
-                self.cloud[name] = layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
-            elif number is not None and name not in self.cloud:
-                table = lfpiv.open_particles(folder, pairs=(number, number + 1))
-                self.cloud[name] = layers.points_of(table, ("x", "y", "z"))
-        return {name: self.cloud[name] for name in wanted if name in self.cloud}
+        if name == "tracks":
+            return layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
+        if number is None:
+            return None
+        return layers.points_of(lfpiv.open_particles(folder, pairs=(number, number + 1)), ("x", "y", "z"))
 
     def _first_look(self) -> None:
         """Choose places, levels and lists that suit the fields."""
@@ -130,10 +113,8 @@ class Results:
         names = [name for name in (*LABELS, *grid.array_names) if name in grid.array_names and name != "velocity"]
         state.r_fields = [{"title": title_of(name), "value": name} for name in dict.fromkeys(names)]
         some = [name for name in SURFACES if name in grid.array_names]
-        state.r_surfaces = [
-            {"title": "none", "value": ""},
-            *({"title": title_of(name), "value": name} for name in some),
-        ]
+        state.r_surfaces = [{"title": "none", "value": ""}]
+        state.r_surfaces += [{"title": title_of(name), "value": name} for name in some]
         state.r_every = max(1, round(max(grid.dimensions) / 16))
         state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
         self._range_of_level()
@@ -179,16 +160,13 @@ class Results:
         self.pending = False
         if self.rest is not None:
             self.rest.cancel()
-        self._draw_at_rest(moving=not self.state.r_playing)
-        if not self.state.r_playing:
-            self.rest = asyncio.get_running_loop().call_later(REST_S, self._draw_at_rest)
+        self._draw_now(moving := not self.state.r_playing)
+        if moving:
+            self.rest = asyncio.get_running_loop().call_later(REST_S, self._draw_now, False)
 
-    def _draw_at_rest(self, moving: bool = False) -> None:
-        """Draw in full, or faster with fewer pixels while something moves."""
-        for picture in self.pictures:
-            picture.plotter.render_window.lfpiv_moving = moving
+    def _draw_now(self, moving: bool) -> None:
         with self.state:
-            self.session.guarded(self.draw)()
+            self.session.guarded(self.draw)(moving)
 
     @property
     def folders(self) -> list[str]:
@@ -201,20 +179,24 @@ class Results:
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
                 raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
-            picture.show(grid, wanted, self.clouds(folder, wanted.moment), title_of(wanted.colour))
+            names = [name for name in ("particles", "tracks") if getattr(wanted, name)]
+            found = {name: self.cloud(name, folder, wanted.moment) for name in names}
+            picture.show(grid, wanted, found, title_of(wanted.colour))
 
-    def draw(self) -> None:
-        """Draw what the state asks for, in both pictures if two runs are compared."""
+    def draw(self, moving: bool = False) -> None:
+        """Draw what the state asks for, in both pictures if two runs are compared; faster while something moves."""
         if self.session.results is None:
             return
         wanted, folders = self.wanted, self.folders
         self.show(wanted)
-        for view in self.views[: len(folders)]:
+        for picture, view in zip(self.pictures, self.views[: len(folders)], strict=False):
+            picture.plotter.render_window.lfpiv_moving = moving
             view.update()
         if self.state.r_own:
             low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
             self.state.r_low, self.state.r_high = float(f"{low:.4g}"), float(f"{high:.4g}")
-        self._chart(wanted, folders)
+        if not moving:
+            self._chart(wanted, folders)
 
     def _chart(self, wanted: look.Look, folders: list[str]) -> None:
         """Draw the histogram of the colour's field, or profiles along the axes through the planes' places."""
@@ -254,18 +236,14 @@ class Results:
         """Turn the camera to a view by its name, or by steps."""
         plotter = self.pictures[0].plotter
         camera = plotter.camera
-        if name in ("left", "right", "up", "down"):
-            angle = {"left": -15.0, "right": 15.0, "up": 15.0, "down": -15.0}[name]
-            camera.Azimuth(angle) if name in ("left", "right") else camera.Elevation(angle)
+        if name in TURNS:
+            right, up, closer = TURNS[name]
+            camera.Azimuth(right)
+            camera.Elevation(up)
             camera.OrthogonalizeViewUp()
-        elif name in ("closer", "farther"):
-            camera.zoom(1.2 if name == "closer" else 1 / 1.2)
+            camera.zoom(closer)
         else:
-            plotter.camera_position = "xy" if VIEWS[name] == "oblique" else VIEWS[name]
-            if name == "oblique":
-                camera.azimuth, camera.elevation = 25.0, 20.0
-            plotter.reset_camera(bounds=self.grid(str(self.session.results), self.wanted.moment).bounds, render=False)
-            camera.zoom(0.85)
+            self.pictures[0].look_along(name, self.grid(str(self.session.results), self.wanted.moment).bounds)
         for picture, view in zip(self.pictures, self.views, strict=True):
             picture.plotter.renderer.ResetCameraClippingRange()
             view.update()
@@ -279,18 +257,8 @@ class Results:
                 self._view_controls()
                 self.files.buttons()
             with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
-                self.views = (self._view(0, "results_name", "true"), self._view(1, "r_other", "!!r_other"))
-
-    def _view(self, number: int, name: str, shown: str) -> Any:
-        with html.Div(classes="lf-view", v_show=shown):
-            html.Div(f"{{{{ {name} }}}}", classes="lf-name")
-            return controls.picture(self.pictures[number].plotter, f"results_{number}", self._linked)
-
-    def _linked(self, *_: Any, **__: Any) -> None:
-        """Show the same camera in both pictures."""
-        if self.state.r_other:
-            for view in self.views:
-                view.update()
+                names = {"{{ results_name }}": "true", "{{ r_other }}": "!!r_other"}
+                self.views = controls.linked(self.pictures, "results", names, lambda: bool(self.state.r_other))
 
     def _moment_controls(self) -> None:
         controls.choice("r_moment", "shown", ("r_moments",), id="r-moment")
@@ -301,13 +269,9 @@ class Results:
         controls.choice("r_colours", "colour map", (list(COLOURS),))
         controls.switch("r_own", "colours over the field's own range")
         with html.Div(v_if="!r_own"):
-            low, high, step = (
-                "Math.min(r_low, -Math.abs(r_high))",
-                "2 * Math.abs(r_high) || 1",
-                "(r_high - r_low) / 100",
-            )
-            controls.slider("r_low", "lowest", (low,), ("r_high",), (step,))
-            controls.slider("r_high", "highest", ("r_low",), (high,), (step,))
+            step = ("(r_high - r_low) / 100",)
+            controls.slider("r_low", "lowest", ("Math.min(r_low, -Math.abs(r_high))",), ("r_high",), step)
+            controls.slider("r_high", "highest", ("r_low",), ("2 * Math.abs(r_high) || 1",), step)
 
     def _layer_controls(self) -> None:
         html.H3("Planes")
@@ -345,8 +309,8 @@ class Results:
     def _view_controls(self) -> None:
         html.H3("View")
         with html.Div(classes="lf-buttons"):
-            for name in VIEWS:
+            for name in look.VIEWS:
                 controls.button(name, (self.look_along, f"['{name}']"))
-            for name, icon in zip(("left", "right", "up", "down", "closer", "farther"), "⟲⟳↑↓+−", strict=True):
+            for name, icon in zip(TURNS, "⟲⟳↑↓+−", strict=True):
                 controls.button(icon, (self.look_along, f"['{name}']"), title=f"turn {name}", id=f"r-turn-{name}")
         controls.choice("r_other", "side by side with", ("r_others",), id="r-other")

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
+from numpy.typing import ArrayLike
 
 from lfpiv.geometry.optics import Optics
+from lfpiv.geometry.orientation import Orientation
 
 SEEN_VOXELS = 32
 """Places along the longest axis at which it is counted how many cameras see them."""
@@ -39,25 +41,15 @@ def view_of(camera: Mapping[str, Any], shape: tuple[int, int]) -> View:
     names = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
     numbers: dict[str, Any] = {name: float(camera[name]) for name in names}
     optics = Optics(**numbers, pixel_mm=float(camera["pixel_um"]) / 1000, sensor_shape=shape)
-    towards = direction_of(camera)
-    right = np.cross([0.0, 1.0, 0.0], towards)
-    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
-    up = np.cross(towards, right)
-    roll = np.radians(float(camera.get("nominal_roll_deg", 0.0)))
-    right, up = np.cos(roll) * right + np.sin(roll) * up, np.cos(roll) * up - np.sin(roll) * right
+    roll, direction = float(camera.get("nominal_roll_deg", 0.0)), camera.get("nominal_direction")
+    if direction is None:
+        orientation = Orientation(float(camera.get("nominal_angle_deg", 0.0)), 0.0, roll)
+    else:
+        orientation = Orientation.from_direction(direction, roll)
+    right, up, towards = orientation.rotation
     half_x, half_y = (0.5 * n * optics.pixel_mm / abs(optics.magnification) for n in (columns, rows))
     corners = np.array([a * half_x * right + b * half_y * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     return optics.object_distance_mm * towards, corners, towards
-
-
-def direction_of(camera: Mapping[str, Any]) -> np.ndarray:
-    """Return the unit vector from the origin towards a nominal camera."""
-    if camera.get("nominal_direction") is not None:
-        vector = np.asarray(camera["nominal_direction"], float)
-    else:
-        angle = np.radians(float(camera.get("nominal_angle_deg", 0.0)))
-        vector = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def pyramid(pupil: np.ndarray, corners: np.ndarray, length: float) -> pv.PolyData:
@@ -109,9 +101,13 @@ def board_plane(board: Mapping[str, Any], z_mm: float) -> pv.PolyData:
 
 def solid_shape(solid: Mapping[str, Any], centre: np.ndarray, size: np.ndarray) -> pv.DataSet:
     """Return the part of a solid that lies in the volume."""
-    box = pv.Box((centre[0] - size[0] / 2, centre[0] + size[0] / 2, centre[1] - size[1] / 2, centre[1] + size[1] / 2,
-                  centre[2] - size[2] / 2, centre[2] + size[2] / 2))  # fmt: skip
     if solid["kind"] == "half_space":
+        box = pv.Box(bounds_of(centre, size))
         return box.clip_closed_surface(normal=-np.asarray(solid["normal"], float), origin=solid["point_mm"])
-    middle, edges = np.asarray(solid["centre_mm"], float), np.asarray(solid["size_mm"], float)
-    return pv.Box(np.column_stack([middle - edges / 2, middle + edges / 2]).ravel())
+    return pv.Box(bounds_of(solid["centre_mm"], solid["size_mm"]))
+
+
+def bounds_of(centre: ArrayLike, size: ArrayLike) -> np.ndarray:
+    """Return the least and largest x, y and z of a box, shape (6,)."""
+    half = np.asarray(size, float) / 2
+    return np.column_stack([np.asarray(centre) - half, np.asarray(centre) + half]).ravel()

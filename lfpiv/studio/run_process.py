@@ -193,10 +193,9 @@ def finished_warnings(out: Path) -> list[dict[str, Any]]:
         summary = read_object(read_text(Folder(out).summary))
     except (OSError, RecordError):
         return []
-    records = summary.get("warning_records") or []
-    sentences = [str(text) for text in summary.get("warnings") or []]
-    found = []
-    for number, sentence in enumerate(sentences):
-        record = records[number] if number < len(records) and isinstance(records[number], dict) else {}
-        found.append({"code": str(record.get("code", "")), "subject": str(record.get("subject", "")), "text": sentence})
-    return found
+    sentences, records = (list(summary.get(name) or []) for name in ("warnings", "warning_records"))
+    records = [record if isinstance(record, dict) else {} for record in [*records, *sentences][: len(sentences)]]
+    return [
+        {"code": str(record.get("code", "")), "subject": str(record.get("subject", "")), "text": str(sentence)}
+        for sentence, record in zip(sentences, records, strict=True)
+    ]

@@ -142,13 +142,10 @@ class Runs:
             with html.Div(classes="lf-bar"):
                 start = self.session.guarded(self.start)
                 controls.button("Start", start, "mdi-play", id="p-start", disabled=(running,), color="primary")
-                controls.button(
-                    "Pause", (control, "['pause']"), "mdi-pause", id="p-pause", v_if="p_status === 'running'"
-                )
-                controls.button(
-                    "Resume", (control, "['resume']"), "mdi-play", id="p-resume", v_if="p_status === 'paused'"
-                )
-                controls.button("Stop", (control, "['stop']"), "mdi-stop", id="p-stop", v_if=running, color="error")
+                shown = {"pause": "p_status === 'running'", "resume": "p_status === 'paused'", "stop": running}
+                for what, when in shown.items():
+                    icon, look = f"mdi-{what.replace('resume', 'play')}", {"color": "error"} if what == "stop" else {}
+                    controls.button(what.title(), (control, f"['{what}']"), icon, id=f"p-{what}", v_if=when, **look)
                 html.Span(
                     "{{ p_status === 'none' ? '' : p_status }} {{ p_end }} {{ p_status === 'running' ? p_left : '' }}",
                     id="p-status",

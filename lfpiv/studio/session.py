@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,19 +98,25 @@ class Session:
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
 
+    @contextlib.contextmanager
+    def busy(self, name: str, what: str) -> Iterator[None]:
+        """Say in a value of the state what is done meanwhile."""
+        with self.state:
+            self.state[name] = what
+        try:
+            yield
+        finally:
+            with self.state:
+                self.state[name] = ""
+
     def offer(self, picture: np.ndarray) -> dict[str, Any]:
         """Offer a picture of counts, (rows, columns) or (rows, columns, 3), to the page; return what it fetches."""
         self.count += 1
         self.offered[self.count] = np.ascontiguousarray(picture, "<f4").tobytes()
         while len(self.offered) > MOST_OFFERED:
             self.offered.pop(next(iter(self.offered)))
-        rows, columns, *channels = picture.shape
-        return {
-            "url": f"data/{self.count}",
-            "rows": rows,
-            "columns": columns,
-            "channels": channels[0] if channels else 1,
-        }
+        rows, columns, channels = (*picture.shape, 1)[:3]
+        return {"url": f"data/{self.count}", "rows": rows, "columns": columns, "channels": channels}
 
     async def aside(self, function: Callable[..., Any], *given: Any) -> Any:
         """Compute in another thread and return the result."""

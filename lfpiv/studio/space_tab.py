@@ -11,6 +11,7 @@ import trame_client.widgets.html as html
 
 from lfpiv.experiment.images import read_header
 from lfpiv.studio import controls, rig_space
+from lfpiv.studio.draft import location_of
 from lfpiv.studio.look import BACKGROUND, INK
 from lfpiv.studio.session import Session
 
@@ -86,7 +87,7 @@ class Space:
             shape = rig_space.solid_shape(solid, centre, size)
             if shape.n_points:
                 p.add_mesh(shape, color=SOLID, opacity=0.6, render=False)
-        box = np.column_stack([centre - size / 2, centre + size / 2]).ravel()
+        box = rig_space.bounds_of(centre, size)
         p.add_mesh(pv.Box(box).extract_all_edges(), color=ink, line_width=2, render=False)
         facts = self._facts(volume, size)
         counted = rig_space.count_seen(views, centre, size)
@@ -131,8 +132,7 @@ class Space:
         elif name.startswith("volume.solid.") and int(name.rpartition(".")[2]) < len(solids):
             solid = solids[int(name.rpartition(".")[2])]
             if solid["kind"] == "box":
-                middle, edges = np.asarray(solid["centre_mm"], float), np.asarray(solid["size_mm"], float)
-                bounds = np.column_stack([middle - edges / 2, middle + edges / 2]).ravel()
+                bounds = rig_space.bounds_of(solid["centre_mm"], solid["size_mm"])
                 p.add_box_widget(self._box_dragged, bounds=bounds, rotation_enabled=False, factor=1.0, color=SOLID)
             else:
                 p.add_plane_widget(
@@ -142,34 +142,30 @@ class Space:
 
     def _box_dragged(self, box: pv.PolyData) -> None:
         bounds = np.asarray(box.bounds)
-        self._write("centre_mm", (bounds[::2] + bounds[1::2]) / 2)
-        self._write("size_mm", bounds[1::2] - bounds[::2])
-        self._follow()
+        self._dragged(centre_mm=(bounds[::2] + bounds[1::2]) / 2, size_mm=bounds[1::2] - bounds[::2])
 
     def _plane_dragged(self, normal: Any, origin: Any) -> None:
-        self._write("normal", np.asarray(normal, float))
-        self._write("point_mm", np.asarray(origin, float))
-        self._follow()
+        self._dragged(normal=normal, point_mm=origin)
 
-    def _write(self, key: str, numbers: np.ndarray) -> None:
-        """Write three numbers into the draft, unless they are there already."""
-        draft, place = self.session.draft, self.state.s_drag
-        if draft is None or not place:
+    def _dragged(self, **moved: Any) -> None:
+        """Write numbers into the draft unless they are there already, and show them in the form.
+
+        There is no new drawing while the handle is held.
+        """
+        draft, location = self.session.draft, location_of(self.state.s_drag)
+        if draft is None or not location:
             return
-        location = [int(part) if part.isdigit() else part for part in place.split(".")]
-        values = [float(f"{value:.{SIGNIFICANT}g}") + 0.0 for value in numbers]
-        old = draft.get([*location, key])
-        if old is None or not np.allclose(old, values, rtol=1e-3, atol=1e-6):
-            draft.set([*location, key], values)
-
-    def _follow(self) -> None:
-        """Show the new numbers in the form, without a new drawing while the handle is held."""
+        for key, numbers in moved.items():
+            values = [float(f"{value:.{SIGNIFICANT}g}") + 0.0 for value in numbers]
+            old = draft.get([*location, key])
+            if old is None or not np.allclose(old, values, rtol=1e-3, atol=1e-6):
+                draft.set([*location, key], values)
         self.dragged = True
         try:
             with self.state:
                 self.session.told("draft")
-                if self.session.draft is not None and not self.session.draft.problems():
-                    volume = self.session.draft.values["volume"]
+                if not draft.problems():
+                    volume = draft.values["volume"]
                     self.state.s_facts = self._facts(volume, np.asarray(volume["size_mm"], float))
         finally:
             self.dragged = False
@@ -192,7 +188,7 @@ class Space:
     def remove(self) -> None:
         """Remove the solid that is being dragged."""
         if self.session.draft is not None and self.state.s_drag.startswith("volume.solid."):
-            self.session.draft.remove(["volume", "solid", int(self.state.s_drag.rpartition(".")[2])])
+            self.session.draft.remove(location_of(self.state.s_drag))
             self.state.s_drag = "volume"
             self.session.told("draft")
             self.draw()
@@ -200,8 +196,7 @@ class Space:
     def look_along(self, name: str) -> None:
         """Look from a side, or obliquely at the volume or the whole rig."""
         volume = self.session.draft.values["volume"] if self.session.draft is not None else {}
-        centre, size = (np.asarray(volume[key], float) for key in ("centre_mm", "size_mm"))
-        self._turn(name, np.column_stack([centre - size / 2, centre + size / 2]).ravel())
+        self._turn(name, rig_space.bounds_of(volume["centre_mm"], volume["size_mm"]))
         self.view.update()
 
     def _turn(self, name: str, box: np.ndarray) -> None:

@@ -77,7 +77,6 @@ def measure(request: dict[str, Any]) -> dict[str, Any]:
         "seconds": round(time.perf_counter() - start, 1),
         "valid": round(100 * float(vectors["valid"].mean()), 1),
         "uncertainty": round(uncertainty, 3) if np.isfinite(uncertainty) else None,
-        "voxels": int(np.prod(experiment.grid.shape)),
         "vectors": int(vectors["valid"].size),
         "calibrated": calibrated,
     }

@@ -141,3 +141,6 @@ def test_cameras_see_what_they_look_at():
     assert rig_space.inside(pupil, corners, points).tolist() == [True, True, False, False]
     opposite = rig_space.view_of(camera | {"nominal_direction": [0, 0, 1]}, (2000, 1000))
     assert np.allclose(opposite[2], [0, 0, 1])
+    _, rolled, _ = rig_space.view_of(camera | {"nominal_angle_deg": 0.0, "nominal_roll_deg": 30.0}, (2000, 1000))
+    along_x = (rolled[1] - rolled[0]) / np.linalg.norm(rolled[1] - rolled[0])
+    assert np.allclose(along_x, [np.sqrt(0.75), -0.5, 0])  # x_c cos r - y_c sin r

@@ -16,9 +16,8 @@
         if (!answer.ok) return;
         const values = new Float32Array(await answer.arrayBuffer());
         if (props.image.url !== wanted.url) return;
-        const same = data && data.rows === wanted.rows && data.columns === wanted.columns;
-        data = { values, rows: wanted.rows, columns: wanted.columns, channels: wanted.channels || 1 };
-        if (!same) view = null;
+        if (!data || data.rows !== wanted.rows || data.columns !== wanted.columns) view = null;
+        data = { ...wanted, values };
         paint();
       }
 
@@ -30,10 +29,8 @@
           for (let c = 0; c < 3; c++) pixels[4 * i + c] = (values[channels === 1 ? i : 3 * i + c] - low) * scale;
           pixels[4 * i + 3] = 255;
         }
-        const scratch = document.createElement('canvas');
-        scratch.width = columns; scratch.height = rows;
-        scratch.getContext('2d').putImageData(new ImageData(pixels, columns, rows), 0, 0);
-        bitmap = scratch;
+        bitmap = Object.assign(document.createElement('canvas'), { width: columns, height: rows });
+        bitmap.getContext('2d').putImageData(new ImageData(pixels, columns, rows), 0, 0);
         draw();
       }
 
@@ -88,10 +85,10 @@
       function arrow(context, x, y, u, v) {
         const turn = Math.atan2(v - y, u - x), head = Math.min(9, Math.hypot(u - x, v - y) / 2);
         context.beginPath();
-        context.moveTo(x, y); context.lineTo(u, v);
-        context.lineTo(u - head * Math.cos(turn - 0.5), v - head * Math.sin(turn - 0.5));
-        context.moveTo(u, v);
-        context.lineTo(u - head * Math.cos(turn + 0.5), v - head * Math.sin(turn + 0.5));
+        context.moveTo(x, y);
+        for (const side of [turn - 0.5, turn + 0.5]) {
+          context.lineTo(u, v); context.lineTo(u - head * Math.cos(side), v - head * Math.sin(side)); context.moveTo(u, v);
+        }
         context.stroke();
       }
 
