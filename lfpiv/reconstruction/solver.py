@@ -122,7 +122,10 @@ class SmartSolver:
         """
         cameras, wanted = len(self.weights.cameras), self.settings.subsets
         automatic, may = isinstance(wanted, str), self.settings.allows_subsets
-        sets = min(self.weights.projector(name).ray_sets for name in self.weights.cameras)
+        projectors = [self.weights.projector(name) for name in self.weights.cameras]
+        sets = min(projector.ray_sets for projector in projectors)
+        if len({projector.rows for projector in projectors}) > 1:  # rows of some cameras, lenses of others
+            sets = 1
         if not all(self._sees_alone(name) for name in self.weights.cameras):
             sets = 1
         rows = min(self.weights.rows, sets)

@@ -29,7 +29,7 @@ class Smart(Table):
     where further steps of the subsets would not improve the volume."""
     subsets: Annotated[int, Field(strict=True, ge=1, le=bounds.MOST_SUBSETS)] | Literal["auto"] = "auto"
     """Number of ordered subsets of the rays: 1 for plain SMART, or up to the rows of pixels across a microimage, 16 at
-    most; where planes of voxels do not share profiles, the number of cameras or twice that. "auto" takes as many as
+    most; where rows cannot be taken alone, the number of cameras or twice that. "auto" takes as many as
     possible and leaves them where they contradict each other; it takes 1 where only the pupil resolves depth, as of one
     camera."""
     relaxation: Annotated[float, Field(strict=True, gt=0, le=3)] = 1.0

@@ -184,12 +184,23 @@ def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
 
 def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
     """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels, or of nodes."""
-    sample = np.unique(np.linspace(0, places.size - 1, SAMPLED_VOXELS).astype(np.int64))
-    model = ray_models(packed.calibrated, places.centres_mm(sample), places.voxel_mm, form)
+    model = _sampled_models(packed, places, form)
     blocks, values = (
         np.concatenate(counts) for counts in zip(*packed.footprints(form, cuts).compute(model), strict=True)
     )
     return float(blocks.mean()), float(values.mean())
+
+
+def sample_rows(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> float:
+    """Return the mean number of rows of rays per voxel in a sample of a grid's voxels, or of nodes."""
+    blocks = blocks_of(packed, [_sampled_models(packed, places, form)], form, cuts=cuts)
+    return float(blocks.height.sum(dtype=np.int64) / len(blocks.scale))
+
+
+def _sampled_models(packed: PackedCamera, places: Places, form: str) -> np.ndarray:
+    """Return the ray models of a sample of a grid's voxels, or of nodes."""
+    sample = np.unique(np.linspace(0, places.size - 1, SAMPLED_VOXELS).astype(np.int64))
+    return ray_models(packed.calibrated, places.centres_mm(sample), places.voxel_mm, form)
 
 
 def blocks_of(

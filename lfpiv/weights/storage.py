@@ -23,6 +23,7 @@ from lfpiv.weights.forms.table import form_named, form_of
 from lfpiv.weights.memory_left import MemoryLeft
 from lfpiv.weights.operator import Weights
 from lfpiv.weights.stored_grid import StoredGrid
+from lfpiv_kernels.reconstruction.weight_blocks import BlockRows
 from lfpiv_kernels.weights.microimages import Microimages
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def _add(digest: Any, name: str, array: np.ndarray) -> None:
         digest.update(content[first : first + _HASHED_BYTES].tobytes())
 
 
-_PARTS = {"microimages": Microimages}
+_PARTS = {"microimages": Microimages, "rows": BlockRows}
 """Fields of `Blocks` that are dataclasses."""
 
 

@@ -221,6 +221,97 @@ LFPIV_INLINE void scatter(const VoxelBlocks& blocks, float intensity, float* ray
     }
 }
 
+/// Blocks of weights whose rows of rays are counted and copied, set by set. A row of pixels under a lens is in set
+/// (row modulo `sets`).
+struct SplitBlocks {
+    const int* first_block;
+    const int64_t* first_value;
+    const int* ray;
+    const unsigned char* height;
+    const unsigned char* width;
+    const unsigned char* value;
+    int edge;  // rays in a row of a microimage, and rows
+    int sets, voxels;
+
+    /// Call work(set, ray, levels, columns) for each row of a voxel's blocks.
+    template <class Work>
+    LFPIV_INLINE void for_rows(int voxel, Work work) const {
+        const unsigned char* level = value + first_value[voxel];
+        for (int block = first_block[voxel]; block < first_block[voxel + 1]; ++block) {
+            const int columns = width[block], row = ray[block] / edge % edge;
+            for (int k = 0; k < height[block]; ++k, level += columns)
+                work((row + k) % sets, ray[block] + k * edge, level, columns);
+        }
+    }
+};
+
+/// Return the blocks from Warp's struct.
+template <class Blocks>
+LFPIV_INLINE SplitBlocks split_blocks(const Blocks& blocks) {
+    return {blocks.first_block.data,
+            (const int64_t*)blocks.first_value.data,
+            blocks.ray.data,
+            blocks.height.data,
+            blocks.width.data,
+            blocks.value.data,
+            blocks.edge,
+            blocks.sets,
+            blocks.voxels};
+}
+
+/// Count a voxel's rows of each set. `count_out` must hold zeros.
+LFPIV_INLINE void count_rows(const SplitBlocks& blocks, int voxel, int* count_out) {
+    blocks.for_rows(
+        voxel, [&](int set, int, const unsigned char*, int) { ++count_out[(int64_t)set * blocks.voxels + voxel]; });
+}
+
+/// Write the first ray and the levels of a voxel's rows. Moves `next_out` from where each set's rows begin to where
+/// they end. Levels beyond a row's columns must be zero before.
+LFPIV_INLINE void write_rows(const SplitBlocks& blocks, int voxel, int* next_out, int* ray_out,
+                             unsigned char* level_out) {
+    blocks.for_rows(voxel, [&](int set, int ray, const unsigned char* level, int columns) {
+        const int row = next_out[(int64_t)set * blocks.voxels + voxel]++;
+        ray_out[row] = ray;
+        for (int k = 0; k < columns; ++k) level_out[(int64_t)BLOCK_WIDTH * row + k] = level[k];
+    });
+}
+
+/// A voxel's rows of rays of one set.
+struct VoxelRows {
+    const int* ray;
+    const unsigned char* level;
+    int count;
+};
+
+/// Return a voxel's rows of a set from the device arrays of `Rows`, see ``block_rows.py``.
+template <class Rows>
+LFPIV_INLINE VoxelRows rows_of(const Rows& rows, int voxel, int set) {
+    const int* const first = rows.first.data + (int64_t)set * rows.voxels + voxel;
+    return {rows.ray.data + first[0], rows.level.data + (int64_t)BLOCK_WIDTH * first[0], first[1] - first[0]};
+}
+
+/// Return the weighted sum of the light on a voxel's rows of rays, in levels.
+LFPIV_INLINE float gather_rows(const VoxelRows& rows, const float* rays) {
+    Row even = splat<BLOCK_WIDTH>(0.0f), odd = even;
+    const unsigned char* level = rows.level;
+    int k = 0;
+    for (; k + 1 < rows.count; k += 2, level += 2 * BLOCK_WIDTH) {
+        even = even + load<BLOCK_WIDTH>(rays + rows.ray[k]) * load_bytes<BLOCK_WIDTH>(level);
+        odd = odd + load<BLOCK_WIDTH>(rays + rows.ray[k + 1]) * load_bytes<BLOCK_WIDTH>(level + BLOCK_WIDTH);
+    }
+    if (k < rows.count) even = even + load<BLOCK_WIDTH>(rays + rows.ray[k]) * load_bytes<BLOCK_WIDTH>(level);
+    return sum(even + odd);
+}
+
+/// Add a voxel's light, in units of one level, to its rows of rays.
+LFPIV_INLINE void scatter_rows(const VoxelRows& rows, float intensity, float* rays_out) {
+    const Row light = splat<BLOCK_WIDTH>(intensity);
+    for (int k = 0; k < rows.count; ++k) {
+        float* const ray = rays_out + rows.ray[k];
+        store(ray, load<BLOCK_WIDTH>(ray) + load_bytes<BLOCK_WIDTH>(rows.level + BLOCK_WIDTH * k) * light);
+    }
+}
+
 #endif
 
 }  // namespace lfpiv

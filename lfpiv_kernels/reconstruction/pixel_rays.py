@@ -164,6 +164,12 @@ class RaySets:
         row, lens = np.divmod(np.arange(-(-microimages.size // group)), lenses)
         return cls(((lens + row // LAYERS) % 2).astype(np.uint8), group, 2)
 
+    @classmethod
+    def of_rows(cls, microimages: Microimages, count: int) -> "RaySets":
+        """Return the rays of every `count`-th row of pixels under each lens."""
+        edge = microimages.edge
+        return cls((np.arange(-(-microimages.size // edge)) % edge % count).astype(np.uint8), edge, count)
+
 
 class RayMap:
     """The linear map from rays to pixels and its adjoint on the running device.

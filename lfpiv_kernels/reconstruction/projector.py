@@ -2,7 +2,8 @@
 
 A block is at most `BLOCK_WIDTH` rays wide, so that its row is one vector. It holds one value per ray, or a profile
 along the columns and one along the rows, whose products are the values. Blocks under even lenses come before those
-under odd ones, so that either half of them can be taken alone. The adjoint gathers per voxel. The projection
+under odd ones, so that either half of them can be taken alone. Blocks may have rows, see ``block_rows``: then sets of
+rows of pixels under every lens can be taken alone in place of lenses. The adjoint gathers per voxel. The projection
 scatters: every part of the voxels adds to rays of its own, which each pixel sums in a fixed order. The innermost loops
 are C++, see ``projector.h``. A GPU has ``projector_gpu`` instead. Twin: ``reference.dense``.
 """
@@ -15,6 +16,7 @@ import warp as wp
 from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.reconstruction import voxels
+from lfpiv_kernels.reconstruction.block_rows import RowLoops
 from lfpiv_kernels.reconstruction.pixel_rays import ALL, RayMap, RaySets
 from lfpiv_kernels.reconstruction.projector_gpu import TiledProjector
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
@@ -132,7 +134,7 @@ def _count_lit(
 
 
 class Projector(RayProjector):
-    """The map of weights stored as blocks. Its sets of rays are those of even and of odd lenses.
+    """The map of weights stored as blocks. Its sets of rays are those of even and of odd lenses, or of rows of pixels.
 
     Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads write the same
     ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts light lies in
@@ -144,8 +146,9 @@ class Projector(RayProjector):
         self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
         self.parts = (blocks,)
         self.ray_sets = 1 if blocks.even_blocks is None else 2
-        """Sets of rays that can be taken alone: those of even and of odd lenses."""
+        """Sets of rays that can be taken alone: those of even and of odd lenses, or of rows of pixels."""
         self._tiled = TiledProjector(blocks) if runtime.device().form == "gpu" else None
+        self._row_loops = None
         if self._tiled is not None:
             self.rays = self._tiled.rays
             self.map = self._map_rays()
@@ -160,6 +163,9 @@ class Projector(RayProjector):
         self._matrix.stride = blocks.microimages.edge
         self._matrix.profiles = blocks.form == "profiles"
         load(_project, runtime.device().warp)  # before threads start
+        if blocks.rows is not None:
+            self.ray_sets = self.rows = blocks.rows.sets
+            self._row_loops = RowLoops(blocks.rows, blocks.scale)
         self._spans = self._find_spans()
         self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
         self.rays = to_device(np.empty(max(int(self._places[-1]), 1), np.float32))  # `scatter` writes it first
@@ -181,8 +187,12 @@ class Projector(RayProjector):
         return 0 if self._tiled is None else self._tiled.nbytes
 
     def _find_spans(self) -> list[tuple[int, int]]:
-        """Return the first ray that each part of the voxels can touch, and the end of its rays."""
+        """Return the first ray that each part of the voxels can touch, and the end of its rays.
+
+        Where rows of pixels are taken alone, these are rays of whole lenses.
+        """
         size, rays = len(self.blocks.scale), self.blocks.microimages
+        whole = rays.edge**2 if self.rows > 1 else 1
         edges = [self.blocks.first_block[size * part // runtime.CHUNKS] for part in range(runtime.CHUNKS + 1)]
         spans = []
         for a, b in itertools.pairwise(edges):
@@ -190,14 +200,18 @@ class Projector(RayProjector):
                 spans.append((0, 0))
                 continue
             first, last, tall = self.blocks.ray[a:b].min(), self.blocks.ray[a:b].max(), self.blocks.height[a:b].max()
-            spans.append((int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + BLOCK_WIDTH, rays.size)))
+            start, stop = int(first), min(int(last) + max(int(tall) - 1, 0) * rays.edge + BLOCK_WIDTH, rays.size)
+            spans.append((start // whole * whole, -(-stop // whole) * whole))
         return spans
 
     def _map_rays(self) -> RayMap:
         """Return the map between pixels and the rays that voxels light."""
         Projector.scatter(self, voxels.ones(len(self.blocks.scale)))
         rays = self.blocks.microimages
-        sets = RaySets.of_lenses(rays) if self.ray_sets == 2 else RaySets.single(rays.size)
+        if self.rows > 1:
+            sets = RaySets.of_rows(rays, self.rows)
+        else:
+            sets = RaySets.of_lenses(rays) if self.ray_sets == 2 else RaySets.single(rays.size)
         if self._tiled is not None:
             light = self._tiled.in_order(to_host(self.rays))
             return RayMap(rays, light, [0, rays.size], [0], sets=sets, places=self._tiled.places)
@@ -210,22 +224,30 @@ class Projector(RayProjector):
         return self.rays
 
     def scatter(self, volume: Values, ray_set: int = ALL) -> None:
-        """Send the light of `volume`, shape (voxel,), to the rays of some lenses. The other rays become dark."""
+        """Send the light of `volume`, shape (voxel,), to the rays of some lenses, or of some rows of pixels.
+
+        The rays of other lenses become dark, those of other rows of pixels stay as they are.
+        """
         light = to_device(volume, float)
         if self._tiled is not None:
             self._tiled.scatter(light, ray_set)
             return
-        rays = to_host(self.rays)
+        rays, loops, edge = to_host(self.rays), self._row_loops, self.microimages.edge
 
         def scatter_part(part, first, last):
-            rays[self._places[part] : self._places[part + 1]] = 0.0
+            own = rays[self._places[part] : self._places[part + 1]]
+            if loops is not None and ray_set != ALL:
+                own.reshape(-1, edge, edge)[:, ray_set :: self.rows] = 0.0
+                loops.scatter(light, ray_set, first, last, self._parts[part])
+                return
+            own[:] = 0.0
             inputs, outputs = [self._matrix, light, ray_set, first], [self._parts[part]]
             wp.launch(_project, dim=last - first, inputs=inputs, outputs=outputs, device="cpu")
 
         runtime.run_chunks(light.size, scatter_part)
 
     def gather(self, out: Given, active: Values | None = None, ray_set: int = ALL) -> Given:
-        """Add the weighted sum of the light on each voxel's rays of some lenses to `out`, shape (voxel,). Return `out`.
+        """Add the weighted sum of the light on each voxel's rays of a set to `out`, shape (voxel,). Return `out`.
 
         Voxels whose `active`, shape (voxel,), float32, is zero stay as they are.
         """
@@ -234,8 +256,12 @@ class Projector(RayProjector):
         if self._tiled is not None:
             self._tiled.gather(volume, mask, ray_set)
         else:
+            loops = self._row_loops
 
             def gather_part(part, first, last):
+                if loops is not None and ray_set != ALL:
+                    loops.gather(self._parts[part], mask, ray_set, first, last, volume)
+                    return
                 inputs = [self._matrix, self._parts[part], mask, ray_set, first]
                 wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)
 

@@ -13,6 +13,25 @@ LOOKED_AT = 16384
 
 
 @dataclass(frozen=True, kw_only=True)
+class BlockRows:
+    """The rows of rays of blocks, set after set, see ``block_rows``."""
+
+    sets: int
+    """Sets of rows: row k of the pixels under a lens is in set k modulo `sets`."""
+    first: np.ndarray
+    """Index of the first row of each voxel, set after set, shape (set * voxel + 1,), int32."""
+    ray: np.ndarray
+    """Index of each row's first ray, shape (row,), int32."""
+    level: np.ndarray
+    """Weights in levels, `BLOCK_WIDTH` of each row, zero beyond its block, shape (row * BLOCK_WIDTH,), uint8."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays [byte]."""
+        return self.first.nbytes + self.ray.nbytes + self.level.nbytes
+
+
+@dataclass(frozen=True, kw_only=True)
 class Blocks:
     """Weights of all voxels for one camera: a sparse matrix with 8-bit values and a scale per column.
 
@@ -43,12 +62,15 @@ class Blocks:
     """Number of each voxel's blocks under even lenses, which come first, shape (voxel,), int32; None for all."""
     even_values: np.ndarray | None = None
     """Number of their values, shape (voxel,), int32."""
+    rows: BlockRows | None = None
+    """The same weights by rows of pixels under every lens; None where these are not taken alone."""
 
     @property
     def nbytes(self) -> int:
         """Memory of all arrays [byte]."""
         names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")
-        return sum(array.nbytes for array in (getattr(self, name) for name in names) if array is not None)
+        arrays = [self.rows, *(getattr(self, name) for name in names)]
+        return sum(array.nbytes for array in arrays if array is not None)
 
     def entries(self, voxel: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the rays of one voxel and their weights, shapes (entry,). A ray may occur twice."""

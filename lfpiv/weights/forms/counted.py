@@ -119,6 +119,7 @@ def count_blocks(
         even_blocks=counts["even_blocks"],
         even_values=counts["even_values"],
         microimages=microimages,
+        rows=None,
         **{name: array.done() for name, array in joined.items()},
     )
 

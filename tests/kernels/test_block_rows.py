@@ -1,0 +1,88 @@
+"""Blocks cut into rows of rays: projection by sets of rows of pixels against the matrix of the blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.random_blocks import VOXELS, matrix_of, random_blocks
+
+from lfpiv_kernels.reconstruction.block_rows import ROW_BYTES, with_rows
+from lfpiv_kernels.reconstruction.pixel_rays import ALL
+from lfpiv_kernels.reconstruction.projector import Projector
+from lfpiv_kernels.transfer import to_device, to_host
+
+TOLERANCE_SUM = 2e-6
+"""Sums of at most 2,000 positive float32 terms in another order, relative to the largest sum."""
+EDGES = [7, 20, 31]
+SETS = [2, 5, 7]
+
+
+@pytest.fixture(params=[(edge, sets) for edge in EDGES for sets in SETS], ids=str)
+def rig(request, device):
+    if device.form == "gpu":
+        pytest.skip("a GPU takes halves of the lenses")
+    edge, sets = request.param
+    blocks = random_blocks("pixels", edge)
+    return blocks, with_rows(blocks, sets), np.arange(blocks.microimages.size) // edge % edge % sets
+
+
+def test_rows_of_a_set_have_the_weights_of_their_rays(rig):
+    blocks, cut, set_of = rig
+    matrix, rows = matrix_of(blocks), cut.rows
+    assert rows.level.size == 8 * rows.ray.size == 8 * int(blocks.height.sum())
+    assert cut.nbytes - blocks.nbytes == ROW_BYTES * rows.ray.size + rows.first.nbytes
+    for number in range(rows.sets):
+        found = np.zeros((len(set_of) + 8, VOXELS))
+        for voxel in range(VOXELS):
+            place = number * VOXELS + voxel
+            for row in range(rows.first[place], rows.first[place + 1]):
+                levels = rows.level[8 * row : 8 * row + 8]
+                found[rows.ray[row] : rows.ray[row] + 8, voxel] += levels * np.float64(blocks.scale[voxel])
+        np.testing.assert_allclose(found[: len(set_of)], matrix * (set_of == number)[:, None], rtol=1e-12)
+
+
+def test_rays_and_voxels_get_the_light_of_a_set(rig):
+    blocks, cut, set_of = rig
+    rng, matrix, projector = np.random.default_rng(1), matrix_of(blocks), Projector(cut)
+    assert projector.ray_sets == projector.rows == cut.rows.sets
+    volume = (rng.random(VOXELS) * (rng.random(VOXELS) < 0.8)).astype(np.float32)
+    active = (rng.random(VOXELS) < 0.7).astype(np.float32)
+    share, pixel = blocks.microimages.share, blocks.microimages.pixel
+    image = rng.random(int(np.prod(blocks.microimages.sensor_shape))).astype(np.float32)
+    for number in (*range(cut.rows.sets), ALL, 0):
+        own = (set_of == number) | (number == ALL)
+        light = np.bincount(pixel[share > 0], (matrix @ volume * share * own)[share > 0], image.size)
+        found = projector.project(volume, np.zeros_like(image), number)
+        np.testing.assert_allclose(found, light, atol=TOLERANCE_SUM * light.max())
+        back = matrix.T @ np.where(share > 0, image[pixel] * share * own, 0)
+        found = projector.back_project(image, np.zeros(VOXELS, np.float32), number)
+        np.testing.assert_allclose(found, back, atol=TOLERANCE_SUM * back.max())
+        with projector.reserved():
+            projector.map.spread(to_device(image[projector.map.pixel], float), projector.returned)
+            some = to_device(np.zeros(VOXELS, np.float32), float)
+            projector.gather(some, to_device(active, float), number)
+        assert not to_host(some)[active == 0].any()
+
+
+def test_all_rays_together_are_those_of_the_blocks_to_the_last_bit(rig):
+    blocks, cut, _ = rig
+    plain, split = Projector(blocks), Projector(cut)
+    rng = np.random.default_rng(2)
+    volume = rng.random(VOXELS).astype(np.float32)
+    image = rng.random(int(np.prod(blocks.microimages.sensor_shape))).astype(np.float32)
+    for _ in range(2):
+        first, second = (one.project(volume, np.zeros_like(image)) for one in (plain, split))
+        np.testing.assert_array_equal(first, second)
+        first, second = (one.back_project(image, np.zeros_like(volume)) for one in (plain, split))
+        np.testing.assert_array_equal(first, second)
+        _ = split.project(volume[::-1].copy(), np.zeros_like(image), 1)  # leaves light on some rays
+
+
+def test_sets_share_out_the_pixels(rig):
+    _, cut, set_of = rig
+    projector, microimages = Projector(cut), cut.microimages
+    lit = (matrix_of(replace(cut, rows=None)).max(1) > 0) & (microimages.share > 0)
+    for number in range(cut.rows.sets):
+        others = np.unique(microimages.pixel[lit & (set_of != number)])
+        own = np.setdiff1d(microimages.pixel[lit & (set_of == number)], others)
+        np.testing.assert_array_equal(np.sort(projector.see_only(number)), own)
