@@ -16,6 +16,7 @@ from lfpiv_kernels import native, runtime
 HEADERS = sorted(native.FOLDER.glob("*.h"))
 CPU_ONLY = {  # a GPU has ``neighbours_gpu``, ``projector_gpu`` and ``separable_gpu`` instead
     "lfpiv_kernels.correlation.neighbours",
+    "lfpiv_kernels.reconstruction.block_rows",
     "lfpiv_kernels.reconstruction.projector",
     "lfpiv_kernels.reconstruction.projector_separable",
 }
