@@ -64,7 +64,7 @@ def estimate_shared(
     none = np.zeros(shared.bend_mm.size, bool)
     bent = _common_bend(found, shared, pixels.decoder.optics.microlens_pitch_mm, none)[1] < _CHANCE
     for order in BEND_ORDERS[1:] if bent else ():
-        higher = _higher(pixels, sample, shared, order, found, margin_mm)
+        higher = _higher(pixels, sample, shared, order, found, margin_mm, stated_diameter_mm)
         if higher is None:
             break
         shared, found = higher
@@ -115,31 +115,53 @@ def _higher(
     order: int,
     found: Sequence[DotFit | None],
     margin_mm: float,
+    stated_diameter_mm: float,
 ) -> tuple[SharedParameters, Sequence[DotFit | None]] | None:
     """Fit a bend of a higher order to some dots; None unless they show it beyond chance and fit better with it.
 
-    Steps go on as long as the typical residual falls much. Diameter and blur stay, because rays that are still bent
-    within a pixel look like blur.
+    Diameter and blur stay, because rays that are still bent within a pixel look like blur. Where the dots show the
+    order but fit no better, those of the lower order may stand for what it lacks. Then the stated diameter without
+    blur is tried.
     """
-    pitch, shared, best = pixels.decoder.optics.microlens_pitch_mm, lower.of_order(order), None
-    known = np.tile(np.arange(len(shared.bend_mm)) < len(lower.bend_mm), 2)
-    found = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, found)
-    typical = _typical(found)[1]
-    bend, chance = _common_bend(found, shared, pitch, known)
-    if not chance < _CHANCE:
-        return None
+    pitch, typical = pixels.decoder.optics.microlens_pitch_mm, _typical(found)[1]
+    known = np.tile(np.arange(bends(order)) < len(lower.bend_mm), 2)
+    for start in (lower, replace(lower, diameter_mm=stated_diameter_mm, blur_px=0.0)):
+        shared = start.of_order(order)
+        fits = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, found)
+        bend, chance = _common_bend(fits, shared, pitch, known)
+        if not chance < _CHANCE:
+            return None
+        if best := _stepped(pixels, sample, shared, bend, fits, margin_mm, _WORTH * typical):
+            return best
+    return None
+
+
+def _stepped(
+    pixels: BoardPixels,
+    sample: Sequence[ExpectedDot],
+    shared: SharedParameters,
+    bend: np.ndarray,
+    found: Sequence[DotFit | None],
+    margin_mm: float,
+    limit: float,
+) -> tuple[SharedParameters, Sequence[DotFit | None]] | None:
+    """Step towards the bend that dots show as long as their typical residual falls much.
+
+    None unless it falls below a limit.
+    """
+    pitch, typical, best = pixels.decoder.optics.microlens_pitch_mm, _typical(found)[1], None
     for _ in range(_ROUNDS):
         change = bend - shared.bend_mm
         change *= min(1.0, _LARGEST_CHANGE * pitch / max(_largest(change), 1e-12))
         shared = replace(shared, bend_mm=shared.bend_mm + change)
         found = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, follow_bend(found, change))
         now = _typical(found)[1]
-        if now < (typical if best else _WORTH * typical):
+        if now < (typical if best else limit):
             best = shared, found
         if not now < _WORTH * typical:
             break
         typical = now
-        bend, _ = _common_bend(found, shared, pitch, np.zeros(len(known), bool))
+        bend, _ = _common_bend(found, shared, pitch, np.zeros(bend.size, bool))
     return best
 
 

@@ -61,9 +61,9 @@ class Voxels(Form):
     def _row_sets(self) -> int:
         """Sets of rows of pixels that SMART can take alone; 1 where the sets are of lenses.
 
-        All cameras have rows, or none. Small volumes have no rows, because their pairs take seconds. A single camera has
-        none, because rows of one pupil do not resolve depth. A GPU has none, because its loops read whole blocks. Rows
-        that do not fit into the memory are left out.
+        All cameras have rows, or none. Small volumes have no rows, because their pairs take seconds. A single camera
+        has none, because rows of one pupil do not resolve depth. A GPU has none, because its loops read whole blocks.
+        Rows that do not fit into the memory are left out.
         """
         rig, sets = self.rig, shared_profiles.ray_sets(self.rig.cameras)
         alike = len(rig.cameras) > 1 and all(rig.choice(name).form == "pixels" for name in rig.cameras)
