@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # the public names, for type checkers
     from lfpiv.lightfield.lens_array import find_lens_array as find_lens_array
     from lfpiv.planning.campaign import plan as plan
     from lfpiv.reconstruction.volume import reconstruct as reconstruct
-    from lfpiv.report import write_report as write_report
+    from lfpiv.report.page import write_report as write_report
     from lfpiv.results.export import export_results as export_results
     from lfpiv.results.particles import open_particles as open_particles
     from lfpiv.results.reader import open_field as open_field
@@ -85,7 +85,7 @@ _MODULES = {
     "thin_lens": "lfpiv.calibration.cameras",
     "vectors_from_links": "lfpiv.tracking.link_vectors",
     "volume_on": "lfpiv.geometry.resampling",
-    "write_report": "lfpiv.report",
+    "write_report": "lfpiv.report.page",
 }
 
 _SUBMODULES = ("derived", "metrics", "statistics")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -22,9 +23,10 @@ from lfpiv.report.markup import number, percent
 from lfpiv.report.slice_panels import slice_panel
 from lfpiv.report.svg import INK, SERIES, new_panel, spread_ticks, style, to_svg
 from lfpiv.results import netcdf
-from lfpiv.simulation.flows import window_mean
-from lfpiv.simulation.scene import Scene, stored_scene
 from lfpiv.velocity.settings import CorrelationSettings
+
+if TYPE_CHECKING:
+    from lfpiv.simulation.scene import Scene
 
 MOST_COMPARED = 4_000
 """Largest number of vectors that are compared; of more, every n-th along x and y."""
@@ -93,6 +95,8 @@ def compare(vectors: xr.Dataset, scene: Scene, pair: int) -> Comparison:
     InputError
         If the file of the flow cannot be read.
     """
+    from lfpiv.simulation.flows import window_mean
+
     edges = np.asarray(vectors.attrs["voxel_mm"], float)
     z, y, x = np.meshgrid(*(vectors[axis].values for axis in AXES), indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -106,6 +110,8 @@ def section(experiment: Experiment, vectors: Mapping[int, Path]) -> str:
     folder = experiment.path.parent / "truth"
     if not vectors or not (folder / "spec.json").is_file():
         return ""
+    from lfpiv.simulation.scene import stored_scene  # with the kernels of the simulator, which take seconds
+
     pair = next(iter(vectors))
     try:
         scene = stored_scene(folder)

@@ -300,7 +300,7 @@ class Run:
             result = summary.build(self.experiment, self.device, calibrated, contents, done, self.earlier, self.folder)
         result |= {"tracks": self._tracks()} | self._usage(done, result["timings_s"])
         if report:
-            from lfpiv.report import write_report
+            from lfpiv.report.page import write_report
 
             start = time.perf_counter()
             vectors = VectorFiles(self.folder, contents.vectors)
