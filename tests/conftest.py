@@ -142,7 +142,7 @@ def empty_report(monkeypatch):
     """Write an empty page in place of the report of a run."""
     from support.small_run import write_empty_report
 
-    monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
+    monkeypatch.setattr("lfpiv.report.page.write_report", write_empty_report)
 
 
 @pytest.fixture(scope="session")

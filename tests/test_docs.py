@@ -92,7 +92,7 @@ def reader(request, place, monkeypatch):
     """A process in that folder; what a snippet does to plots and logging is undone. Only README.md writes reports."""
     monkeypatch.chdir(place)
     if request.node.callspec.params["name"] != "README.md":
-        monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
+        monkeypatch.setattr("lfpiv.report.page.write_report", write_empty_report)
     backend, handlers, level = matplotlib.get_backend(), logging.root.handlers[:], logging.root.level
     matplotlib.use("agg")
     yield place

@@ -197,7 +197,7 @@ def spoilt(small_run, tmp_path_factory):
     logger.setLevel(logging.CRITICAL)
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("lfpiv.report.write_report", lambda *arguments: None)
+            patch.setattr("lfpiv.report.page.write_report", lambda *arguments: None)
             summary = pipeline.run(file, out, keep_volumes=True)
     finally:
         logger.setLevel(before)
@@ -248,7 +248,7 @@ def test_warnings_outlive_the_invocation(spoilt, tmp_path, monkeypatch):
     """A second run and a new report give the warnings of the first run."""
     file, out, first = spoilt
     pages = []
-    monkeypatch.setattr("lfpiv.report.write_report", lambda *arguments: pages.append(arguments[2]["warnings"]))
+    monkeypatch.setattr("lfpiv.report.page.write_report", lambda *arguments: pages.append(arguments[2]["warnings"]))
     for again in (pipeline.run(file, out, keep_volumes=True), pipeline.report(file, out)):
         assert again["warnings"] == first["warnings"] and len(first["warnings"]) > len(first["pairs"])
     assert pages == [first["warnings"]] * 2

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from support.small_run import write_empty_report
 
-from lfpiv import report
+from lfpiv.report import page
 
 SEED = 3
 every_row = imperfect_scenes.rows  # replaced by fewer rows while the case is computed
@@ -28,7 +28,7 @@ def tiny(tmp_path_factory):
     ):
         patch.setitem(table, "small", tiny_value)
     patch.setattr(imperfect_scenes, "rows", lambda scale: {key: ROWS[key] for key in ("ideal", "half", "unknown")})
-    patch.setattr(report, "write_report", write_empty_report)  # of two runs; the page of the case is whole
+    patch.setattr(page, "write_report", write_empty_report)  # of two runs; the page of the case is whole
     out = tmp_path_factory.mktemp("beyond")
     try:
         imperfections.main(["--out", str(out), "--seed", str(SEED)])

@@ -60,7 +60,7 @@ def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path, monke
     assert all(0.02 < figures["standing_share"] < 0.5 for figures in summary["background"].values())
     assert not any("stands still" in text or "moved" in text for text in summary["warnings"])
     np.testing.assert_allclose(mean_displacement(whole, 0), DISPLACEMENT_VOXEL, atol=TOLERANCE_VOXEL)
-    monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
+    monkeypatch.setattr("lfpiv.report.page.write_report", write_empty_report)
     written = (whole / "background.h5").stat().st_mtime_ns
     again = pipeline.run(experiment, whole, pairs=(0, 1))
     assert "vectors of pair 0" in again["reused"] and again["background"] == summary["background"]

@@ -165,7 +165,7 @@ def test_a_summary_of_many_pairs_lists_some_and_names_the_file_of_all(small_run,
     assert found["valid_fraction"] == pytest.approx(small_run.summary["valid_fraction"], rel=1e-12)
     assert f"{PAIRS} pairs finished, of which 2, evenly chosen" in (out / "report.html").read_text("utf-8")
     monkeypatch.undo()
-    monkeypatch.setattr("lfpiv.report.write_report", write_empty_report)
+    monkeypatch.setattr("lfpiv.report.page.write_report", write_empty_report)
     again = pipeline.report(small_run.experiment, out)
     assert again["pairs"] == small_run.summary["pairs"] and again["pairs_file"] is None
     assert not (out / "pairs.jsonl").exists()

@@ -85,11 +85,11 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
 
 
 BRIEF = """
-import lfpiv.report
+import lfpiv.report.page
 from lfpiv.cli import commands
 from lfpiv.weights import counting
 
-lfpiv.report.write_report = lambda *given: given[-1].write_text("", "utf-8")
+lfpiv.report.page.write_report = lambda *given: given[-1].write_text("", "utf-8")
 counting.VOXELS = 2
 commands.main()
 """
