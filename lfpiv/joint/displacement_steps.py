@@ -2,9 +2,9 @@
 
 Both frames have the misfit of SMART. Its gradient by the displacement d of a voxel is
 ``-s/2 c grad(T^T G' e_f)``, with the exponent e_f of SMART. Its curvature takes the derivative of the moved light to
-the images, divides by P + b, and takes it back. The curvature of a part of the subsets stands for all, since it changes
-slowly with the rays. The prior is `ROUGH` times the misfit per lit pixel times the squared second differences of the
-nodes. Conjugate gradients, preconditioned by the light near each node, solve for the step.
+the images, divides by P + b, and takes it back. The curvature of some subsets and of the brightest voxels stands for
+all, since it changes slowly with both. The prior is `ROUGH` times the misfit per lit pixel times the squared second
+differences of the nodes. Conjugate gradients, preconditioned by the light near each node, solve for the step.
 """
 
 from __future__ import annotations
@@ -32,6 +32,10 @@ LEAST_SHARE, LEAST_CURVATURE = 0.05, 1e-3
 """Least light of a node in the preconditioner, relative to the mean, and least curvature, relative to the mean."""
 SECOND_DIFFERENCES = 18.0
 """Largest diagonal element of the prior: 6 of the squared second differences along each of three axes."""
+
+
+BRIGHT = 0.9
+"""Share of the light whose voxels make the curvature."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +165,7 @@ class DisplacementSteps:
         self, light: np.ndarray, transports: tuple[Transport, Transport], residuals: Sequence[Residual]
     ) -> Callable[[np.ndarray], np.ndarray]:
         """Return the map from a change of the nodes to a change of the gradient."""
-        model = self.model
+        model, light = self.model, brightest(light, BRIGHT)
         own = [model.light_of(number, light) for number in range(2)]
         shares = [self._part.share(frame.images) for frame in model.frames]
         curvatures = [
@@ -217,3 +221,11 @@ class DisplacementSteps:
             mean = (draw * curvature(draw)).sum((1, 2, 3)) / (draw**2).sum((1, 2, 3))
             self._scale = np.maximum(mean, LEAST_CURVATURE * mean.max())[:, None, None, None]
         return self._scale
+
+
+def brightest(light: np.ndarray, share: float) -> np.ndarray:
+    """Return the brightest voxels, which hold a share of the light; 0 elsewhere."""
+    falling = np.sort(light, axis=None)[::-1]
+    sums = falling.cumsum(dtype=np.float64)
+    least = falling[np.searchsorted(sums, share * sums[-1])]
+    return np.where(light >= least, light, np.float32(0))

@@ -41,7 +41,7 @@ ROUNDS = (
     Round(True, 1, 3, 1.5),
     Round(True, 1, 3, 1.5),
     Round(True, 2, 6, 1.0),
-    Round(False, 2, 6, 1.0),
+    Round(False, 3, 6, 1.0),
 )
 """Rounds of the fit."""
 SETTLED_VOXEL = 0.02
@@ -51,7 +51,7 @@ LOST, JUDGED = 3.2, 2
 """
 UNEQUAL = 0.13
 """Rms of rho, weighted by the light, above which they are: the fit begins again with brightness that may differ."""
-PART = 2
+PART = 4
 """The curvature is taken from one subset of the rays in so many."""
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from lfpiv.joint.spline_field import SplineField
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
-from lfpiv.reconstruction.sieve import TRUNCATE, coefficients
+from lfpiv.reconstruction.sieve import TRUNCATE, Sieve, coefficients
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.filters.blur import GaussianBlur
 from lfpiv_kernels.reconstruction.transport import SPREAD, Transport
@@ -66,13 +66,15 @@ class JointModel:
         self.lit = (lit[0] | lit[1]).astype(np.float32)
         """1 for voxels that a camera sees and that hold fluid in some frame, else 0, shape (z, y, x)."""
 
-    @cached_property
-    def _rest(self) -> GaussianBlur | None:
-        """The part of the sieve that the spline leaves, G'."""
+    @property
+    def rest_voxel(self) -> float:
+        """Standard deviation of G', the part of the sieve that the spline leaves [voxel]."""
         sigma = math.sqrt(max(self.sieve_voxel**2 - SPREAD, 0.0))
-        if sigma < LEAST_BLUR_VOXEL:
-            return None
-        return GaussianBlur(sigma, self.weights.grid.shape, truncate=TRUNCATE, border="constant")
+        return 0.0 if sigma < LEAST_BLUR_VOXEL else sigma
+
+    @cached_property
+    def _rest(self) -> Sieve:
+        return Sieve(self.rest_voxel, self.weights.grid.shape)
 
     @cached_property
     def _wide(self) -> GaussianBlur:
@@ -80,7 +82,7 @@ class JointModel:
 
     def sieved(self, volume: np.ndarray) -> np.ndarray:
         """Return G' of a volume (z, y, x): its own adjoint."""
-        return volume if self._rest is None else _blurred(self._rest, volume)
+        return _blurred(self._rest, volume)
 
     def smoothed(self, volume: np.ndarray) -> np.ndarray:
         """Return a volume (z, y, x) blurred by `SMOOTH_VOXEL`."""
@@ -121,6 +123,6 @@ class JointModel:
         return light
 
 
-def _blurred(blur: GaussianBlur, volume: np.ndarray) -> np.ndarray:
+def _blurred(blur: GaussianBlur | Sieve, volume: np.ndarray) -> np.ndarray:
     flat = to_device(np.ascontiguousarray(volume, np.float32).reshape(-1), float)
     return to_host(blur(flat)).reshape(volume.shape)
