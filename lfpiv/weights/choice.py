@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,10 +27,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PROFILES_MEAN, PROFILES_WORST = 0.015, 0.025
-"""Largest relative L2 error of profiles with which they are chosen: mean and worst voxel of the sample."""
 AIM_MEAN, AIM_WORST = 0.02, 0.035
-"""Relative L2 error of weights above which a warning is logged: mean and worst voxel of the sample."""
+"""Relative L2 error of weights, mean and worst voxel of the sample, up to which profiles are chosen, and above which a
+warning is logged."""
 PIXELS_GAIN = 0.8
 """Largest ratio of the mean error of pixels to that of profiles with which pixels are chosen."""
 CUTS: tuple[Cuts, ...] = (
@@ -62,7 +61,8 @@ def choose_forms(
 ) -> tuple[dict[str, Choice], dict[str, CountedVoxels]]:
     """Choose the form of each camera's footprints; return the voxels, too, that were counted for it.
 
-    The form "auto" is chosen by counted rays where the microlenses are square.
+    The form "auto" is chosen by counted rays where the microlenses are square. Where a camera needs pixels, all cameras
+    take them, since SMART can take rows of pixels alone only if all cameras have rows.
     """
     choices, counted = {}, {}
     for name, camera in cameras.items():
@@ -71,6 +71,11 @@ def choose_forms(
             choices[name] = choose_form(counted[name])
         else:
             choices[name] = choose_uncounted(stored, camera, form)
+    if any(choice.form == "pixels" for choice in choices.values()):
+        for name, choice in choices.items():
+            if choice.form == "profiles":
+                choices[name] = replace(choice, form="pixels", cuts=choose_cuts(stored, cameras[name]))
+                log.info("weights of camera %s are stored pixel by pixel, as those of other cameras", name)
     return choices, counted
 
 
@@ -117,7 +122,7 @@ def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[f
 
 def profiles_serve(errors: Sequence[float]) -> bool:
     """Return whether profiles are near enough to counted rays. True if the camera sees no voxel."""
-    return not errors or bool(np.mean(errors) <= PROFILES_MEAN and max(errors) <= PROFILES_WORST)
+    return not errors or bool(np.mean(errors) <= AIM_MEAN and max(errors) <= AIM_WORST)
 
 
 def choose_cuts(stored: StoredGrid, camera: CalibratedCamera) -> Cuts:
