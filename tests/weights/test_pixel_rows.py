@@ -114,3 +114,11 @@ def test_particles_are_found_by_rows_better_than_by_halves_of_the_lenses(hexagon
         volume = lfpiv.reconstruct(weights, images, floor=0.01, sieve_voxel=0.7)
         alike.append(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
     assert alike[0] > alike[1] and alike[0] > 0.85
+
+
+def test_where_a_camera_needs_pixels_all_cameras_take_them_and_have_rows(device):
+    square = {"two": IdealCamera("two", rotation(-45), optics(250, 270), lattice())}
+    mixed = IdealRig({"one": hexagonal_rig().cameras["one"], **square})
+    assert set(lfpiv.build_weights(IdealRig(square), GRID).forms.values()) == {"profiles"}
+    weights = lfpiv.build_weights(mixed, GRID)
+    assert set(weights.forms.values()) == {"pixels"} and weights.rows == ray_sets(mixed.cameras)
