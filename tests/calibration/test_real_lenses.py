@@ -28,7 +28,7 @@ from lfpiv.warn import Code
 TERM_ERROR = 0.02  # of terms that are 1 at the edge: third moments of a pixel are left out
 STANDARD_ERRORS = 5.0  # 1e-6 chance for each of some hundred numbers
 MAPPING_PITCH = 0.006  # goal of the project; the labels' form alone left 0.005 to 0.1
-TRUE_SHARE = 1.5  # stated error over the true one, or the reverse
+TRUE_SHARE = 1.5  # stated error over the true one, or the reverse; 0.82 to 1.15 in four rigs alike, 1.53 in a fifth
 PITCH = 0.1
 
 
@@ -87,26 +87,33 @@ def test_displaced_rays_are_found_in_their_zone_and_none_in_noise():
 
 
 F_NUMBER = {"heliar": 4.5}
+INNER_PUPIL = 0.9
+"""Part of the pupil over which errors beside a larger board are stated."""
 HELIAR_PITCH = 0.025
 """Largest mean error of the Heliar's mapping: .012 here, .058 with a bend of third order before five planes."""
 
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
-    """Calibrate a camera behind a published lens; return calibration and true error by name of the lens."""
+    """Calibrate a camera behind a published lens; return calibration, and true error by name of the lens.
+
+    With `dots`, the board has so many a row and the error is that over 0.9 of the pupil.
+    """
     known = {}
 
-    def calibrate(name):
+    def calibrate(name, dots=None):
         if name not in known:
             more = {"f_number": F_NUMBER.get(name, 4.0), "lens": {"prescription": name}}
             more["microlens_focal_length_mm"] = 0.2 * more["f_number"]
             camera = scenes.camera("only", -30.0, (420, 400), true_yaw_deg=-33.0, **more)
-            particles = {"count": 10, "pairs": 1}
+            particles, planes = {"count": 10, "pairs": 1}, (-0.8, -0.2, 0.4)
+            board = {"dots": (dots, dots), "spacing_mm": 2.16 / (dots - 1), "dot_diameter_mm": 0.1} if dots else None
             scene = scenes.scene(
                 *("real", [camera]),
-                planes_mm=(-0.8, -0.2, 0.4),
+                planes_mm=planes,
                 particles=particles,
                 displacement_mm=(0.05, 0, 0),
+                **({"board": board | {"planes_mm": planes}} if board else {}),
             )
             folder = tmp_path_factory.mktemp("lens") / name
             simulate(scene, folder)
@@ -115,7 +122,7 @@ def calibrated(tmp_path_factory):
             true = true_mapping(json.loads((folder / "truth/spec.json").read_text("utf-8"))["camera"][0])
             random = np.random.default_rng(1)
             points = random.uniform(*camera.region_mm, (4000, 3))
-            pupil = random_on_pupil(camera.optics.pupil_radius_mm, 4000, random)
+            pupil = random_on_pupil((INNER_PUPIL if dots else 1) * camera.optics.pupil_radius_mm, 4000, random)
             error = np.linalg.norm(camera.map(points, pupil) - true(points, pupil), axis=1) / camera.lattice.pitch_mm
             known[name] = calibration, error[np.isfinite(error)].mean()
         return known[name]
@@ -132,8 +139,11 @@ def test_a_double_gauss_is_mapped_to_fifth_order(calibrated):
 
 @pytest.mark.slow
 def test_rays_that_the_form_cannot_follow_are_told(calibrated):
-    """Rays of this Cooke triplet at full aperture turn back over the pupil's edge."""
-    calibration, error = calibrated("cooke_triplet")
+    """Rays of this Cooke triplet at full aperture turn back over the pupil's edge.
+
+    With 25 dots a plane the network's error at the border of the board depends on rounding.
+    """
+    calibration, error = calibrated("cooke_triplet", dots=7)
     camera = calibration.cameras["only"]
     told = [warning for warning in camera.warnings if warning.code is Code.PUPIL_ZONE]
     assert len(told) == 1

@@ -83,12 +83,12 @@ class Stored:
         key = f"{case}, {loops}"
         if self.anew:
             self.content["hashes"][key] = digest(arrays)
-            self.content["figures"][case] = {name: figures(values) for name, values in arrays.items()}
+            self.content["figures"][key] = {name: figures(values) for name, values in arrays.items()}
             FILE.write_text(as_text(self.content), "utf-8")
         elif self.content["machine"] == machine():
-            changed = "; ".join(differences(self.content["figures"][case], arrays)) or "by rounding"
+            changed = "; ".join(differences(self.content["figures"][key], arrays)) or "by rounding"
             assert digest(arrays) == self.content["hashes"][key], f"{key}: other bits than stored, {changed}"
             assert changed == "by rounding", f"{key}: these figures are stale, store them anew: {changed}"
         else:
-            found = list(differences(self.content["figures"][case], arrays, listed))
+            found = list(differences(self.content["figures"][key], arrays, listed))
             assert not found, f"{key}: {found}"

@@ -40,7 +40,7 @@ def test_a_camera_from_above_with_another_lens_and_a_hexagonal_array_needs_no_tr
         network={"hidden": (8,), "epochs": 60},
     )
     summary = lfpiv.run(simulate(scene, tmp_path / "data"), tmp_path / "out", device=device.kind)
-    assert summary["weights"]["form"] == {"left": "profiles", "right": "profiles", "above": "pixels"}
+    assert summary["weights"]["form"] == dict.fromkeys(("left", "right", "above"), "pixels")
     assert np.mean(summary["weights"]["count_check_l2"]) < WEIGHTS_ERROR
     vectors = xr.load_dataset(tmp_path / "out" / "vectors" / "pair_0000.nc", engine="h5netcdf")
     error = np.stack(
