@@ -19,6 +19,9 @@ LIBRARIES = ("numpy", "scipy", "warp-lang", "taichi", "opencv-python-headless")
 OTHER_MACHINE = 0.03
 """Difference of a figure from the stored one, over the array's norm, on another machine. Where rounding decides on a
 peak or a subset, whole vectors change."""
+OTHER_LIST = 0.05
+"""The same for a list of particles: rounds of fitting, removing and adding them amplify rounding. With the BLAS and
+the vector units of another processor norms differ by 0.02 and 0.031."""
 DIGITS = 6
 
 
@@ -51,13 +54,14 @@ def figures(values):
 
 
 def differences(stored, arrays, listed=False):
-    """Yield what differs from the stored figures by more than `OTHER_MACHINE`; of a list only the norm is compared.
+    """Yield what differs from the stored figures by more than `OTHER_MACHINE`, of a list by `OTHER_LIST`.
 
-    Where rounding decides on an element of a list, all behind it move, and so does the projection.
+    Where rounding decides on an element of a list, all behind it move, and so does the projection: only norms count.
     """
     for name, values in arrays.items():
         (norm, along), (own_norm, own_along) = stored[name], figures(values)
-        if max(abs(own_norm - norm), 0 if listed else abs(own_along - along)) > OTHER_MACHINE * norm:
+        moved = abs(own_norm - norm) if listed else max(abs(own_norm - norm), abs(own_along - along))
+        if moved > (OTHER_LIST if listed else OTHER_MACHINE) * norm:
             yield f"{name}: norm {own_norm}, projection {own_along}, stored {norm}, {along}"
 
 

@@ -100,5 +100,8 @@ def test_tracks_of_a_series(series, stored, loops):
     expected = np.array(DISPLACEMENT_VOXEL) * VOXEL_MM / 1000 / DT_S
     np.testing.assert_allclose(speed.mean(axis=0), expected, atol=BIAS * VOXEL_MM / 1000 / DT_S)
     stored.check(
-        "series: tracks", loops, {name: tracks[name].values for name in ("track", "instant", "x", "u", "valid")}
+        "series: tracks",
+        loops,
+        {name: tracks[name].values for name in ("track", "instant", "x", "u", "valid")},
+        listed=True,
     )
