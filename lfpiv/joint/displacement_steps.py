@@ -32,8 +32,6 @@ LEAST_SHARE, LEAST_CURVATURE = 0.05, 1e-3
 """Least light of a node in the preconditioner, relative to the mean, and least curvature, relative to the mean."""
 SECOND_DIFFERENCES = 18.0
 """Largest diagonal element of the prior: 6 of the squared second differences along each of three axes."""
-
-
 BRIGHT = 0.9
 """Share of the light whose voxels make the curvature."""
 

@@ -3,8 +3,8 @@
 A subset is some rows of pixels under every lens, of all cameras at once. Such rows see a part of the pupil each, and
 all of the volume. Where weights have no rows, as of small volumes, a subset is the rays of one camera through every
 other lens. Its pixels are those that see no other set of rays; a pixel between two of them takes part in whole passes
-only. The exponent of subset n is sum_{i in n} w log((I + b) / (P + b)). Its step is that of
-`lfpiv.reconstruction.steps` with max(s_n, s / N) in place of s, where s_n are the weights' sums over the subset and N
+only. The exponent of subset n is sum_{i in n} w log((I + b) / (P + b)). Its step is as in
+`lfpiv.reconstruction.steps`, with max(s_n, s / N) in place of s, where s_n are the weights' sums over the subset and N
 is the number of subsets. For rows of pixels s_n is nearly the same part of s in all voxels, and that part of the
 volume's light stands for it. Momentum goes on from subset to subset [1]_.
 

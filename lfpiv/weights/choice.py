@@ -75,7 +75,7 @@ def choose_forms(
         for name, choice in choices.items():
             if choice.form == "profiles":
                 choices[name] = replace(choice, form="pixels", cuts=choose_cuts(stored, cameras[name]))
-                log.info("weights of camera %s are stored pixel by pixel, as those of other cameras", name)
+                log.info("weights of camera %s are stored pixel by pixel, as the other cameras' are", name)
     return choices, counted
 
 

@@ -134,7 +134,7 @@ def _count_lit(
 
 
 class Projector(RayProjector):
-    """The map of weights stored as blocks. Its sets of rays are those of even and of odd lenses, or of rows of pixels.
+    """The map of weights stored as blocks. Its sets of rays belong to even and to odd lenses, or to rows of pixels.
 
     Each part of the voxels that a CPU launch takes has memory of its own for its rays. So no two threads write the same
     ray, and results do not depend on the number of threads. The light of a ray that voxels of two parts light lies in
@@ -146,7 +146,7 @@ class Projector(RayProjector):
         self.blocks, self.form, self.nbytes = blocks, blocks.form, blocks.nbytes
         self.parts = (blocks,)
         self.ray_sets = 1 if blocks.even_blocks is None else 2
-        """Sets of rays that can be taken alone: those of even and of odd lenses, or of rows of pixels."""
+        """Sets of rays that can be taken alone: by even and odd lenses, or by rows of pixels."""
         self._tiled = TiledProjector(blocks) if runtime.device().form == "gpu" else None
         self._row_loops = None
         if self._tiled is not None:
@@ -226,7 +226,7 @@ class Projector(RayProjector):
     def scatter(self, volume: Values, ray_set: int = ALL) -> None:
         """Send the light of `volume`, shape (voxel,), to the rays of some lenses, or of some rows of pixels.
 
-        The rays of other lenses become dark, those of other rows of pixels stay as they are.
+        The rays of other lenses become dark, other rows of pixels stay as they are.
         """
         light = to_device(volume, float)
         if self._tiled is not None:

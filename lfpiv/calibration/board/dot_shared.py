@@ -120,7 +120,7 @@ def _higher(
     """Fit a bend of a higher order to some dots; None unless they show it beyond chance and fit better with it.
 
     Diameter and blur stay, because rays that are still bent within a pixel look like blur. Where the dots show the
-    order but fit no better, those of the lower order may stand for what it lacks. Then the stated diameter without
+    order but fit no better, the blur of the lower order may stand for what it lacks. Then the stated diameter without
     blur is tried.
     """
     pitch, typical = pixels.decoder.optics.microlens_pitch_mm, _typical(found)[1]
