@@ -26,6 +26,7 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
+from lfpiv.calibration.liquid import median_distance
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
     Measured,
@@ -208,7 +209,7 @@ def _calibrate_camera(
         dots = replace(dots, points_mm=corrected)
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     residual = dots.array_mm - lens(dots.points_mm, dots.pupil_mm)
-    typical_pitch = float(np.median(np.linalg.norm(residual, axis=1))) / sensor.lattice.pitch_mm
+    typical_pitch = median_distance(residual) / sensor.lattice.pitch_mm
     if measured.surface is None:
         checks.check_pupil(experiment, setup, dots, lens, typical_pitch)
     nominal = checks.compare_with_nominal(setup, lens, typical_pitch, measured.surface)

@@ -47,7 +47,7 @@ def _forms(calibration: Calibration, grid: Grid, form: str, particle_voxel: floa
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare weights with counted rays in a few random voxels of every camera.
 
-    Warn of weights whose error exceeds the aim, unless `choose_form` did so before.
+    Warn of weights whose error exceeds the aim, unless `choose_forms` did so before.
 
     Returns
     -------

@@ -71,34 +71,47 @@ def choose_forms(
             choices[name] = choose_form(counted[name])
         else:
             choices[name] = choose_uncounted(stored, camera, form)
+    alone = choices
     if any(choice.form == "pixels" for choice in choices.values()):
-        for name, choice in choices.items():
-            if choice.form == "profiles":
-                choices[name] = replace(choice, form="pixels", cuts=choose_cuts(stored, cameras[name]))
-                log.info("weights of camera %s are stored pixel by pixel, as the other cameras' are", name)
+        choices = {name: _as_pixels(stored, cameras[name], choice) for name, choice in choices.items()}
+    for name, voxels in counted.items():
+        _tell(voxels, choices[name], alone[name])
     return choices, counted
 
 
+def _as_pixels(stored: StoredGrid, camera: CalibratedCamera, choice: Choice) -> Choice:
+    """Return a choice with weights pixel by pixel."""
+    return choice if choice.form == "pixels" else replace(choice, form="pixels", cuts=choose_cuts(stored, camera))
+
+
 def choose_form(counted: CountedVoxels) -> Choice:
-    """Choose profiles unless their error is too large and that of pixels is clearly smaller. Log why, and warn."""
-    profiles = errors = form_errors(counted, "profiles")
+    """Choose profiles unless their error is too large and that of pixels is clearly smaller."""
+    profiles = form_errors(counted, "profiles")
     choice = Choice(form="profiles", profile_errors=tuple(profiles))
-    if not profiles_serve(profiles):
-        cuts = choose_cuts(counted.stored, counted.camera)
-        pixels = form_errors(counted, "pixels", cuts)
-        if np.mean(pixels) <= PIXELS_GAIN * np.mean(profiles):
-            choice, errors = Choice(form="pixels", cuts=cuts, profile_errors=tuple(profiles)), pixels
-        text = "weights of camera %s pixel by pixel differ from counted rays by %.1f %%"
-        log.info(text, counted.camera.name, 100 * np.mean(pixels))
+    if profiles_serve(profiles):
+        return choice
+    cuts = choose_cuts(counted.stored, counted.camera)
+    pixels = form_errors(counted, "pixels", cuts)
+    log.info(
+        "weights of camera %s pixel by pixel differ from counted rays by %.1f %%",
+        counted.camera.name, 100 * np.mean(pixels),
+    )  # fmt: skip
+    return replace(choice, form="pixels", cuts=cuts) if np.mean(pixels) <= PIXELS_GAIN * np.mean(profiles) else choice
+
+
+def _tell(counted: CountedVoxels, choice: Choice, alone: Choice) -> None:
+    """Log why a form was chosen, and warn if its weights are not accurate. `alone` is the camera's choice by itself."""
+    name, profiles = counted.camera.name, choice.profile_errors
     if profiles:
+        so = "so" if choice.form == "profiles" else "pixel by pixel"
         log.info(
             "weights of camera %s as products of profiles differ from counted rays by %.1f %% (worst voxel %.1f %%): "
             "they are stored %s",
-            *(counted.camera.name, 100 * np.mean(profiles), 100 * max(profiles)),
-            "so" if choice.form == "profiles" else "pixel by pixel",
+            *(name, 100 * np.mean(profiles), 100 * max(profiles)),
+            so if choice.form == alone.form else f"{so}, as the other cameras' are",
         )
+    errors = list(profiles or ()) if choice.form == "profiles" else form_errors(counted, choice.form, choice.cuts)
     warn_of_errors(counted, choice.form, errors, requested=False)
-    return choice
 
 
 def choose_uncounted(stored: StoredGrid, camera: CalibratedCamera, form: str) -> Choice:

@@ -9,9 +9,9 @@ from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation, 
 import lfpiv
 from lfpiv.lightfield.decoder import disc_fraction
 from lfpiv.lightfield.microimage_layout import microimage_centres, microimages_of
-from lfpiv.warn import collected
+from lfpiv.warn import Code, collected
 from lfpiv.weights import blocks as weightblocks
-from lfpiv.weights import counting
+from lfpiv.weights import choice, counting
 from lfpiv.weights.blocks import WHOLE, PackedCamera, blocks_of
 from lfpiv.weights.checks import compare_with_count, estimate_memory
 from lfpiv.weights.choice import choose_cuts, choose_form, form_errors
@@ -402,6 +402,17 @@ def test_form_follows_the_optics_and_the_limit_is_kept():
         assert errors and np.mean(errors) <= FOOTPRINT_MEAN and max(errors) <= FOOTPRINT_WORST, name
     with pytest.raises(ValueError, match=r"camera 'bent'.* as pixels.*weights_form to 'profiles'"):
         lfpiv.build_weights(IdealRig(cameras), grid, limit_bytes=weights.memory_bytes // 4)
+
+
+def test_the_form_that_a_rig_takes_is_judged_and_no_other(monkeypatch):
+    """By itself the bent camera would take profiles that are not accurate; beside a hexagonal one it takes pixels."""
+    monkeypatch.setattr(choice, "PIXELS_GAIN", 0.0)
+    grid = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(0.2, 0.2, 0.2), voxel_mm=VOXEL_MM)
+    bent = {"bent": IdealCamera("bent", rotation(-45), coma=0.02)}
+    for others, forms in (({}, ["profiles"]), ({"hexagonal": RIGS["hexagonal"]}, [])):
+        with collected() as told:
+            lfpiv.build_weights(IdealRig(bent | others), grid)
+        assert [one.figures["form"] for one in told if one.code is Code.WEIGHTS_DIFFER] == forms
 
 
 def test_a_voxel_is_cut_only_along_edges_that_matter():
