@@ -80,13 +80,8 @@ def frame_light(
     for name, camera in cameras.items():
         raw = experiment.frame_image(name, frame) if read is None else read(name, frame)
         top = experiment.camera(name).white_level
-        dark = darks[name]
-        image = raw if dark is None else raw - dark
-        level, noise[name] = camera.decoder.background(image)
-        light = image - np.float32(level)
-        if camera.standing is not None:
-            light, noise[name] = camera.standing.subtract(light, noise[name], frame.laser)
-        images[name] = light
+        images[name], noise[name] = without_background(camera, raw, darks[name], frame)
+        light = images[name]
         clipped[name] = saturated_pixels(raw, top)
         structure[name] = seen_structure(light, camera.decoder)
         fingerprints[name] = image_checks.fingerprint(raw)
@@ -104,6 +99,16 @@ def frame_light(
         seconds=time.perf_counter() - start,
         clipped=clipped,
     )
+
+
+def without_background(
+    camera: CalibratedCamera, raw: np.ndarray, dark: np.ndarray | None, frame: Frame
+) -> tuple[np.ndarray, float]:
+    """Return a recorded image without dark image and background, and the noise of the background [counts]."""
+    image = raw if dark is None else raw - dark
+    level, noise = camera.decoder.background(image)
+    light = image - np.float32(level)
+    return (light, noise) if camera.standing is None else camera.standing.subtract(light, noise, frame.laser)
 
 
 def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: FrameLight) -> tuple[Warning, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
-from lfpiv.runs.frame_light import frame_light, read_darks
+from lfpiv.runs.frame_light import read_darks, without_background
 from lfpiv.selfcalibration.disparity import CameraVolumes, still_light, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
 from lfpiv.warn import Code, Warning, warn
@@ -253,10 +253,13 @@ class ShownParticles:
 
     def _light(self, frame: Frame) -> Mapping[str, np.ndarray]:
         """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
-        found = frame_light(self.experiment, self.cameras, self._darks, frame)
-        if min(found.structure.values()) < NOISE:
-            raise ValueError("expected particles, found only noise")
-        return found.images
+        found = {}
+        for name, camera in self.cameras.items():
+            raw = self.experiment.frame_image(name, frame)
+            found[name], _ = without_background(camera, raw, self._darks[name], frame)
+            if seen_structure(found[name], camera.decoder) < NOISE:
+                raise ValueError("expected particles, found only noise")
+        return found
 
 
 def all_show_particles(frames: Sequence[Mapping[str, np.ndarray]], cameras: Mapping[str, CalibratedCamera]) -> bool:

@@ -127,27 +127,39 @@ def test_the_mistake_with_which_a_liquid_explains_the_labels_is_found(mistake):
     assert mistake_in_liquid(dots_of, tried, stated, optics) == mistake
 
 
-@pytest.mark.slow
-def test_pictures_that_are_mirrored_in_water_are_told_as_such(tmp_path):
+@pytest.fixture(scope="module")
+def in_water(tmp_path_factory):
+    """Folder of a camera that looks obliquely into water."""
+    folder = tmp_path_factory.mktemp("water")
     camera = scenes.camera("only", -40.0, (420, 400), true_yaw_deg=-42.0, **tank(1.333))
     more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
-    path = simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
-    path.write_text(path.read_text("utf-8").replace("nominal_angle_deg = -40", "nominal_angle_deg = 40"), "utf-8")
+    simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_pictures_that_are_mirrored_in_water_are_told_as_such(in_water):
+    """Three of the planes show it."""
+    path, text = in_water / "mirrored.toml", (in_water / "experiment.toml").read_text("utf-8")
+    for old, new in (
+        ("nominal_angle_deg = -40", "nominal_angle_deg = 40"),
+        ("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, -0.4, 0.0]"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text, "utf-8")
     with pytest.raises(lfpiv.InputError, match=r"mirrored left to right.*nominal_angle_deg has the wrong sign"):
         lfpiv.calibrate(path)
 
 
 @pytest.mark.slow
-def test_a_camera_that_looks_obliquely_into_water_is_calibrated(tmp_path):
-    camera = scenes.camera("only", -40.0, (420, 400), true_yaw_deg=-42.0, **tank(1.333))
-    more = {"particles": {"count": 10, "pairs": 1}, "displacement_mm": (0.05, 0, 0)}
-    simulate(scenes.scene("tank", [camera], planes_mm=(-0.8, -0.4, 0.0, 0.4, 0.8), **more), tmp_path)
-    camera = lfpiv.calibrate(tmp_path / "experiment.toml").cameras["only"]
+def test_a_camera_that_looks_obliquely_into_water_is_calibrated(in_water):
+    camera = lfpiv.calibrate(in_water / "experiment.toml").cameras["only"]
     (medium,) = camera.warnings
     assert medium.code is Code.MEDIUM
     assert medium.figures["index"] == pytest.approx(1.333, abs=INDEX)
     assert camera.report["dots_found"] == 5 * 25
-    spec = json.loads((tmp_path / "truth" / "spec.json").read_text("utf-8"))["camera"][0]
+    spec = json.loads((in_water / "truth" / "spec.json").read_text("utf-8"))["camera"][0]
     rng = np.random.default_rng(1)
     points, pupil = rng.uniform(*camera.region_mm, (4000, 3)), random_on_pupil(camera.optics.pupil_radius_mm, 4000, rng)
     miss = camera.map(points, pupil) - true_mapping(spec)(points, pupil)
