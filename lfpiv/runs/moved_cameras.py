@@ -43,6 +43,9 @@ LIKE = 0.5
 AGREEING = 2
 """Least number of pairs that agree on cameras that moved, where more than one was used: chance peaks differ by pair."""
 
+KEPT_BYTES = 64 << 20
+"""Memory of the images that are kept while pairs are compared. Small images are read once in place of three times."""
+
 CLEAR = 2 * NOISE
 """Structure of images above which cameras that show no common particles are warned of."""
 
@@ -213,7 +216,7 @@ class ShownParticles:
 
     @cached_property
     def _recent(self) -> dict[Frame, Mapping[str, np.ndarray]]:
-        """The images that were read last: those of all pairs may not fit into memory."""
+        """The images that were read last, up to `KEPT_BYTES`, and those of a pair in any case."""
         return {}
 
     @cached_property
@@ -235,13 +238,8 @@ class ShownParticles:
         return [self._moving(frame) for frame in self.experiment.pair_frames(pair)]
 
     def _moving(self, frame: Frame) -> Mapping[str, np.ndarray]:
-        if frame not in self._recent:
-            still = self._still
-            found = without_still_light(self._light(frame), still) if still else self._light(frame)
-            for old in list(self._recent)[: 1 - len(self.experiment.frames)]:
-                del self._recent[old]
-            self._recent[frame] = found
-        return self._recent[frame]
+        still = self._still
+        return without_still_light(self._light(frame), still) if still else self._light(frame)
 
     def _readable(self, pair: int) -> list[Mapping[str, np.ndarray]]:
         """Return the images of both frames with the light that stays in place; none if those of one cannot be used."""
@@ -253,12 +251,18 @@ class ShownParticles:
 
     def _light(self, frame: Frame) -> Mapping[str, np.ndarray]:
         """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
+        if frame in self._recent:
+            return self._recent[frame]
         found = {}
         for name, camera in self.cameras.items():
             raw = self.experiment.frame_image(name, frame)
             found[name], _ = without_background(camera, raw, self._darks[name], frame)
             if seen_structure(found[name], camera.decoder) < NOISE:
                 raise ValueError("expected particles, found only noise")
+        kept = max(len(self.experiment.frames), KEPT_BYTES // sum(image.nbytes for image in found.values()))
+        for old in list(self._recent)[: max(len(self._recent) + 1 - kept, 0)]:
+            del self._recent[old]
+        self._recent[frame] = found
         return found
 
 
