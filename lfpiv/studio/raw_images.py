@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
 
 import lfpiv
-from lfpiv.calibration.board.dots import DotBoard
-from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.images import FLIPS
@@ -24,6 +23,9 @@ from lfpiv.geometry.optics import spread_over_pupil
 from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.results.folder import Folder
+
+if TYPE_CHECKING:
+    from lfpiv.calibration.camera import CalibratedCamera
 
 HOT_SIGMA, HOT_RATIO = 12.0, 5.0
 """Least height of a hot pixel: in standard deviations of the noise, and over the height of its highest neighbour."""
@@ -150,6 +152,8 @@ class RawImages:
         arrows : ndarray, shape (n, 4)
             From a measured dot's predicted place, `ARROW_GAIN` times its residual [pixel].
         """
+        from lfpiv.calibration.board.dots import DotBoard  # imports Taichi
+
         found, board = self.calibrated(camera), DotBoard.from_settings(self.experiment.board)
         numbers = plane * board.size + np.flatnonzero(board.occupied)
         places = self._light_px(camera, found.map(board.of_dots_mm(numbers), np.zeros((len(numbers), 2))))
@@ -211,9 +215,8 @@ class RawImages:
         for number in range(len(pupil)):
             at = (fan[:, number] - origin) @ basis - low
             value = ndimage.map_coordinates(stack[number], at.T, order=1, cval=np.nan, prefilter=False)
-            known = np.isfinite(value)
-            total[known] += value[known]
-            seen += known
+            total += np.nan_to_num(value)
+            seen += np.isfinite(value)
         mean = np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)
         return mean.reshape(len(y), len(x)).astype(np.float32)
 

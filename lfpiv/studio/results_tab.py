@@ -20,6 +20,7 @@ from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
 COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
+CLOUDS = ("particles", "tracks")
 REST_S = 0.25
 """Time without a change after which a picture is drawn with all its pixels."""
 TURNS = {
@@ -61,6 +62,7 @@ class Results:
         self.state.change("r_playing")(lambda **_: session.start(self._play()))
         self.files = Files(self)
         session.listeners.append(self._opened)
+        session.server.controller.on_client_connected.add(lambda **_: self.request())  # the chart, after the picture
         self._panel()
 
     def _opened(self, what: str) -> None:
@@ -69,8 +71,7 @@ class Results:
             return
         for kept in (self.open, self.grid, self.cloud):
             kept.cache_clear()
-        self.charted = ()
-        places, folder = self.session.places, self.session.results
+        self.charted, places, folder = (), self.session.places, self.session.results
         others = [{"title": places.name(path), "value": str(path)} for path in places.results()]
         self.state.r_others = [{"title": "nothing", "value": ""}, *others]
         if folder is None:
@@ -113,8 +114,7 @@ class Results:
         names = [name for name in (*LABELS, *grid.array_names) if name in grid.array_names and name != "velocity"]
         state.r_fields = [{"title": title_of(name), "value": name} for name in dict.fromkeys(names)]
         some = [name for name in SURFACES if name in grid.array_names]
-        state.r_surfaces = [{"title": "none", "value": ""}]
-        state.r_surfaces += [{"title": title_of(name), "value": name} for name in some]
+        state.r_surfaces = [{"title": title_of(name) if name else "none", "value": name} for name in ("", *some)]
         state.r_every = max(1, round(max(grid.dimensions) / 16))
         state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
         self._range_of_level()
@@ -151,7 +151,7 @@ class Results:
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:  # before the server runs
-            self.session.guarded(self.draw)()
+            self.session.guarded(self.draw)(True)
             return
         self.pending = True
         loop.call_soon(self._draw_requested)
@@ -179,9 +179,8 @@ class Results:
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
                 raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
-            names = [name for name in ("particles", "tracks") if getattr(wanted, name)]
-            found = {name: self.cloud(name, folder, wanted.moment) for name in names}
-            picture.show(grid, wanted, found, title_of(wanted.colour))
+            clouds = {name: self.cloud(name, folder, wanted.moment) for name in CLOUDS if getattr(wanted, name)}
+            picture.show(grid, wanted, clouds, title_of(wanted.colour))
 
     def draw(self, moving: bool = False) -> None:
         """Draw what the state asks for, in both pictures if two runs are compared; faster while something moves."""

@@ -32,7 +32,6 @@ from lfpiv.records import RecordError, validate
 from lfpiv.velocity.likeness import Likeness
 from lfpiv.velocity.modes import weighted
 from lfpiv.velocity.systematic import DAMPING, without_ghosts
-from lfpiv.velocity.validation import fill
 
 SIGNIFICANT = 2.0
 """Least distance of a slope from 1, and of an offset from 0, that is corrected [standard error]."""
@@ -274,5 +273,7 @@ def _from_mean(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def displacement(vectors: xr.Dataset) -> np.ndarray:
     """Return the displacement along (z, y, x) [voxel], filled where it is masked, shape (z, y, x, 3)."""
+    from lfpiv.velocity.validation import fill  # imports Warp, which readers of results need not
+
     found = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], axis=-1).astype(float)
     return fill(found, np.isfinite(found).all(-1))

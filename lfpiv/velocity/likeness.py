@@ -15,7 +15,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.velocity.coverage import LEAST_SEEDED
 from lfpiv.velocity.systematic import without_ghosts
 
 WHOLE_FLUID = 0.99
@@ -101,6 +100,8 @@ def usable(vectors: xr.Dataset) -> np.ndarray:
 
     Vectors that validation replaced count.
     """
+    from lfpiv.velocity.coverage import LEAST_SEEDED  # imports Warp, which readers of results need not
+
     whole: np.ndarray = vectors["fluid_share"].values >= WHOLE_FLUID
     seeded: np.ndarray = vectors["seeded_share"].values >= LEAST_SEEDED
     used: np.ndarray = whole & seeded & np.isfinite(vectors["displacement_x"].values)

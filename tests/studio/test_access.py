@@ -93,3 +93,9 @@ def test_without_the_extra_one_message_names_it(monkeypatch, capsys, tmp_path):
 def test_nothing_there_is_told(capsys, tmp_path):
     assert commands.call(["studio", str(tmp_path / "nothing"), "--no-browser"]) == 2
     assert "found nothing there" in capsys.readouterr().err
+
+
+def test_the_page_is_built_without_the_libraries_of_kernels():
+    asked = "import sys, lfpiv.studio.page; print({'taichi', 'warp', 'scipy.optimize'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
