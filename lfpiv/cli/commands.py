@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lfpiv.cli import benchmark, init, interrupts, terminal
+from lfpiv.cli import benchmark, init, interrupts, questions, terminal
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
 from lfpiv.version import __version__
@@ -171,8 +171,8 @@ def _plan(
     _output.show(found.to_json(), lambda: terminal.print_card(found))
 
 
-@_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {init.EXAMPLE}")
-@init.with_options
+@_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {questions.EXAMPLE}")
+@questions.with_options
 def _init(
     experiment: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The file to write.")] = Path(
         "experiment.toml"

@@ -10,8 +10,9 @@ import numpy as np
 
 from lfpiv.calibration import contradictions
 from lfpiv.calibration.board.board import find_board
-from lfpiv.calibration.board.detect import planes_from_middle, rectifier
+from lfpiv.calibration.board.detect import rectifier
 from lfpiv.calibration.board.dots import DotBoard
+from lfpiv.calibration.board.first_lattice import planes_from_middle
 from lfpiv.calibration.board.planes import Signals, board_images
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.calibration.measured_camera import decode, likely_cause

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 import lfpiv
-from lfpiv.cli import commands, init
+from lfpiv.cli import commands, questions
 from lfpiv.experiment.toml import read_toml, tomllib
 from lfpiv.settings.experiment import ExperimentTable
 
-EXAMPLE = shlex.split(init.EXAMPLE)
+EXAMPLE = shlex.split(questions.EXAMPLE)
 
 
 class Terminal(io.StringIO):
@@ -113,7 +113,7 @@ def test_without_a_terminal_all_missing_options_are_named(tmp_path, capfd):
     path = tmp_path / "experiment.toml"
     assert call(path, "--name", "jet") == 2
     message = capfd.readouterr().err
-    required = {one.option for one in init.QUESTIONS if one.default is None} - {"--name", "--voxel"}
+    required = {one.option for one in questions.QUESTIONS if one.default is None} - {"--name", "--voxel"}
     assert message.count("\n") == 1 and all(option in message for option in required)
     assert call(path, *without("--pixel")) == 2
     message = capfd.readouterr().err
@@ -153,7 +153,9 @@ def test_a_terminal_is_asked_for_what_is_left_out_until_the_answer_can_be_read(t
         index = words.index(option)
         del words[index : index + 2]
     given = {word.partition("=")[0] for word in words}
-    text = "".join(f"{answers[one.key]}\n" for one in init.QUESTIONS if one.option not in given and one.key in answers)
+    text = "".join(
+        f"{answers[one.key]}\n" for one in questions.QUESTIONS if one.option not in given and one.key in answers
+    )
     monkeypatch.setattr(sys, "stdin", Terminal(text))
     assert call(path, *words) == 0
     said, asked = capfd.readouterr()

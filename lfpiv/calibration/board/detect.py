@@ -15,6 +15,13 @@ import numpy as np
 
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated, sites_found
+from lfpiv.calibration.board.first_lattice import (
+    FIRST_PLANES,
+    FirstLattice,
+    first_lattice,
+    lattice_of_plane,
+    planes_from_middle,
+)
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import BIN_PITCHES, Blobs, CameraPose, Rectified, Rectifier
 from lfpiv.errors import InputError
@@ -28,11 +35,7 @@ log = logging.getLogger(__name__)
 FULLY_SEEN = 0.9
 """Least share of a site's light on lit pixels for an empty site to mean something."""
 
-_FIRST_PLANES = 3  # planes that are searched for the lattice with the nominal pose
 _FEWEST_SHARE = 0.25  # least share of the dots in the field on the first lattice
-_REGULAR = 0.5  # least share of the strongest blobs on one lattice
-_PEAK_SPACINGS = 0.4  # distance between blobs of the first lattice
-_INLIER_SPACINGS = 0.2  # largest distance of a blob from its site on the first lattice
 _SEARCH_SPACINGS = 0.35  # largest distance of a dot from where the pose expects it
 _JUDGED_DOTS = 6  # least number of blobs of a plane that distinguish a board from chance
 _JUDGED_BINS = 3  # least search radius that distinguishes them [elements]
@@ -125,45 +128,10 @@ def rectifier(decoder: LightFieldDecoder, board: DotBoard, pose: CameraPose | No
     return Rectifier(decoder, (half_x, half_y), board.diameter_mm, pupil_share=share)
 
 
-@dataclass(frozen=True, eq=False)
-class FirstLattice:
-    """The lattice that one plane shows with the nominal pose."""
-
-    points_mm: np.ndarray
-    """Board points of the dots, shape (d, 3) [mm]."""
-    chief_mm: np.ndarray
-    """Their chief rays on the array, shape (d, 2) [mm]."""
-    sign: int
-    """+1 for bright dots, -1 for dark ones."""
-    score: float
-    """Sum of their contrasts."""
-    share: float
-    """Share of the strongest blobs, as many as the board has dots, on one lattice."""
-
-    @property
-    def regular(self) -> bool:
-        """Whether the blobs are a board, not chance."""
-        return self.share >= _REGULAR
-
-
-def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose) -> FirstLattice:
-    """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
-    order = planes_from_middle(board)
-    found: list[FirstLattice] = []
-    for plane in order:
-        if len(found) >= _FIRST_PLANES and any(lattice.regular for lattice in found):
-            break
-        rectified = rectify(signals.of_plane(plane), plan, board.planes_mm[plane])
-        found.append(lattice_of_plane(rectified, board, plan, plane))
-    candidates = [lattice for lattice in found if lattice.regular] or found
-    best = max(lattice.score for lattice in candidates)
-    return next(lattice for lattice in candidates if lattice.score >= best / 2)  # planes near z = 0 are more certain
-
-
 def _require_lattice(start: FirstLattice, board: DotBoard, plan: CameraPose, stated: str, optics: Optics) -> None:
     """Refuse a lattice of too few dots, and blobs that are no lattice. `stated` is what the message asks to check."""
     order = planes_from_middle(board)
-    visible = max(in_field(plan, board.points_mm(plane), optics).sum() for plane in order[:_FIRST_PLANES])
+    visible = max(in_field(plan, board.points_mm(plane), optics).sum() for plane in order[:FIRST_PLANES])
     fewest = min(max(FEWEST_DOTS, _FEWEST_SHARE * visible), board.size)
     if len(start.points_mm) < fewest or not start.regular:
         chance = len(start.points_mm) > 0 and not start.regular
@@ -173,87 +141,6 @@ def _require_lattice(start: FirstLattice, board: DotBoard, plan: CameraPose, sta
             f"z = {board.planes_mm[order[0]]:g} mm; found {len(start.points_mm)} dots of it{blobs}. Check that these "
             f"are board images, the board's numbers and {stated}."
         )
-
-
-def planes_from_middle(board: DotBoard) -> np.ndarray:
-    """Return the numbers of the planes, the nearest to z = 0 first."""
-    return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
-
-
-def lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
-    """Match the lattice to the blobs of a plane, bright or dark ones."""
-    best = FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
-    for sign in (1, -1):
-        blobs = rectified.peaks(_PEAK_SPACINGS * board.spacing_mm, sign)
-        match = _match_lattice(blobs, board)
-        score = float(blobs.contrast[match.member].sum())
-        if score > best.score:
-            points = board.points_mm(plane)[match.index[:, 1] * board.dots[0] + match.index[:, 0]]
-            at = np.column_stack([blobs.position_mm[match.member], np.full(len(points), board.planes_mm[plane])])
-            strongest = np.argsort(-blobs.contrast, kind="stable")[: board.size]
-            best = FirstLattice(points, pose.rays(at)[0], sign, score, float(match.regular[strongest].mean()))
-    return best
-
-
-@dataclass(frozen=True, eq=False)
-class _LatticeMatch:
-    """Blobs on the lattice of a board."""
-
-    index: np.ndarray
-    """Column and row of each blob that is a dot of the board, shape (n, 2)."""
-    member: np.ndarray
-    """Numbers of these blobs, shape (n,)."""
-    regular: np.ndarray
-    """Blobs on the lattice, on the board or beyond it, shape (blobs,), bool."""
-
-
-def _match_lattice(blobs: Blobs, board: DotBoard) -> _LatticeMatch:
-    """Find the lattice in a cloud of blobs that may lack dots and contain others.
-
-    The board's middle is the admissible lattice site nearest to the origin.
-    """
-    peaks, contrast = blobs.position_mm, blobs.contrast
-    if len(peaks) < 1:
-        return _LatticeMatch(np.empty((0, 2), int), np.empty(0, int), np.zeros(0, bool))
-    inverse, phase = _lattice_waves(blobs, board)
-    for _ in range(6):
-        site = peaks @ inverse.T - phase
-        index = np.rint(site)
-        close = np.hypot(*(site - index).T) < _INLIER_SPACINGS
-        if close.sum() < 3 or np.linalg.matrix_rank(index[close] - index[close].mean(0)) < 2:
-            break
-        design = np.column_stack([peaks[close], np.ones(close.sum())])
-        fit = np.linalg.lstsq(design, index[close], rcond=None)[0]
-        inverse, phase = fit[:2].T, -fit[2]
-    site = peaks @ inverse.T - phase
-    index = np.rint(site).astype(int)
-    middle = (np.array(board.dots) - 1) / 2
-    index += np.rint(middle + phase).astype(int)  # the origin's site is -phase
-    regular = np.hypot(*(site - np.rint(site)).T) < _INLIER_SPACINGS
-    member = np.flatnonzero(((index >= 0) & (index < board.dots)).all(1) & regular)
-    member = member[np.argsort(-contrast[member], kind="stable")]  # the stronger of two blobs at one site
-    _, first = np.unique(index[member], axis=0, return_index=True)
-    member = np.sort(member[first])
-    return _LatticeMatch(index[member], member, regular)
-
-
-def _lattice_waves(blobs: Blobs, board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix and phase of site = matrix @ position - phase: the plane waves that fit the blobs best.
-
-    The wave vectors are searched near (1, 0) and (0, 1) per spacing.
-    """
-    weight = np.minimum(blobs.contrast, 3 * np.median(blobs.contrast))
-    size, turn = np.meshgrid(np.linspace(0.75, 1.35, 61), np.radians(np.linspace(-9, 9, 37)), indexing="ij")
-    prior = np.exp(-0.5 * (np.log(size) / 0.3) ** 2 - 0.5 * (turn / np.radians(9)) ** 2).ravel()
-    along = np.stack([size * np.cos(turn), size * np.sin(turn)], -1).reshape(-1, 2) / board.spacing_mm
-    waves, phases = [], []
-    for axis, count in enumerate(board.dots):
-        wave = along if axis == 0 else along[:, ::-1] * (-1, 1)
-        sums = np.exp(2j * np.pi * wave @ blobs.position_mm.T) @ weight
-        best = np.argmax(np.abs(sums) * prior) if count > 1 else np.argmax(prior)
-        waves.append(wave[best])
-        phases.append(np.angle(sums[best]) / (2 * np.pi))
-    return np.array(waves), np.array(phases)
 
 
 @dataclass(frozen=True, eq=False)

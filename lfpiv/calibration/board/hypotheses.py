@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lfpiv.calibration.board.detect import find_in_planes, first_lattice, rectifier
+from lfpiv.calibration.board.detect import find_in_planes, rectifier
 from lfpiv.calibration.board.dots import DotBoard
+from lfpiv.calibration.board.first_lattice import first_lattice
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
 from lfpiv.geometry.orientation import Orientation

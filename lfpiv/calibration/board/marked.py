@@ -16,14 +16,13 @@ from lfpiv.calibration.board.detect import (
     PlaneDots,
     find_in_planes,
     in_field,
-    lattice_of_plane,
     lit_share,
-    planes_from_middle,
     rectifier,
     search_planes,
 )
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard
 from lfpiv.calibration.board.edges import MARGIN, sites_found
+from lfpiv.calibration.board.first_lattice import lattice_of_plane, planes_from_middle
 from lfpiv.calibration.board.mark import Naming, name_by_mark, search_board
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
