@@ -2,9 +2,9 @@
 Fit both frames and the flow at once
 ====================================
 
-Both frames of a pair show the same particles, moved by one flow. Fitted together (`smart.estimate = "joint"` in the
-experiment file), they give smaller errors than two volumes that are correlated, and a field between the vectors. It
-takes several times as long, and needs two or more cameras.
+Both frames of a pair show the same particles, moved by one flow. Fitted together, as `lfpiv run` does with two and more
+cameras, they give smaller errors than two volumes that are correlated (`smart.estimate = "correlation"`), and a field
+between the vectors. It takes several times as long.
 """
 
 from pathlib import Path

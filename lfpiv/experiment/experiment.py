@@ -181,6 +181,13 @@ class Experiment(Shown):
         return list(dict.fromkeys(self.mask.file_of(frame.fields) for frame in frames))
 
     @property
+    def is_joint(self) -> bool:
+        """Whether both frames of a pair are fitted together with their displacement."""
+        if self.smart.estimate == "auto":
+            return len(self.cameras) > 1 and not self.recording.is_series and not self.by_links
+        return self.smart.estimate == "joint"
+
+    @property
     def in_sequence(self) -> bool:
         """Whether each instant of a series is reconstructed from the one before."""
         return self.recording.is_series and self.smart.predict
@@ -287,7 +294,12 @@ class Experiment(Shown):
     @property
     def simulated_pairs(self) -> int:
         """Number of pairs that are simulated to measure the damping by ghosts; 0 for none."""
-        return 0 if self.by_links else self.bootstrap.count(self.pairs)
+        return self.simulated_of(self.pairs)
+
+    def simulated_of(self, pairs: int) -> int:
+        """Return the number of simulated pairs for a number of recorded ones. A joint fit hardly damps."""
+        unasked = self.is_joint and self.bootstrap.pairs == "auto"
+        return 0 if self.by_links or unasked else self.bootstrap.count(pairs)
 
     @property
     def by_links(self) -> bool:

@@ -3,8 +3,10 @@
 Both frames have the misfit of SMART. Its gradient by the displacement d of a voxel is
 ``-s/2 c grad(T^T G' e_f)``, with the exponent e_f of SMART. Its curvature takes the derivative of the moved light to
 the images, divides by P + b, and takes it back. The curvature of some subsets and of the brightest voxels stands for
-all, since it changes slowly with both. The prior is `ROUGH` times the misfit per lit pixel times the squared second
-differences of the nodes. Conjugate gradients, preconditioned by the light near each node, solve for the step.
+all, since it changes slowly with both. The prior is a weight times twice the misfit per lit pixel times the squared
+second differences of the nodes: first `ROUGH`, then, for each component along each axis, the inverse of the mean square
+that the nodes have, so that smooth flows are fitted smoothly. Conjugate gradients, preconditioned by the light near
+each node, solve for the step.
 """
 
 from __future__ import annotations
@@ -23,7 +25,10 @@ from lfpiv_kernels.reconstruction.transport import Transport
 from lfpiv_kernels.transfer import to_device, to_host
 
 ROUGH = 0.3
-"""Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel."""
+"""Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel, as long as theirs
+are not known."""
+STIFFEST = 30.0
+"""Largest weight, of a displacement without second differences."""
 SMALL_REST = 1e-3
 """Share of the first residual below which conjugate gradients end."""
 LARGEST_MOVE = 1.0
@@ -180,23 +185,27 @@ class DisplacementSteps:
 
         return change
 
-    def step(self, light: np.ndarray, nodes: np.ndarray, relaxation: float, steps: int) -> Step:
-        """Return a step of the nodes by some conjugate gradient steps, times a factor, and at most `LARGEST_MOVE`."""
+    def step(self, light: np.ndarray, nodes: np.ndarray, relaxation: float, steps: int, *, settled: bool) -> Step:
+        """Return a step of the nodes by some conjugate gradient steps, times a factor, and at most `LARGEST_MOVE`.
+
+        The second differences of nodes that are settled set the weight of the prior, else it is `ROUGH`.
+        """
         model = self.model
         transports = model.transports(nodes)
         residuals = self.residuals(light, transports)
         misfit = sum(one.misfit for one in residuals)
         gradient = self.gradient(light, transports, residuals)
         curvature = self.curvature(light, transports, residuals)
-        rough = ROUGH * 2 * misfit / self._lit_pixels
+        weights = 1 / (model.field.bends(nodes) + 1 / STIFFEST) if settled else np.full((3, 3), ROUGH)
+        rough = weights * 2 * misfit / self._lit_pixels
         scale = self._curvature_scale(curvature, nodes)
         floor = LEAST_CURVATURE * float(scale.mean())
         near = model.field.adjoint(np.broadcast_to(light, (3, *light.shape)))
         near = np.maximum(near / near.mean(), LEAST_SHARE)
-        inverse = 1 / (scale * near + rough * SECOND_DIFFERENCES + floor)
+        inverse = 1 / (scale * near + rough.mean(1)[:, None, None, None] * SECOND_DIFFERENCES + floor)
         change = conjugate_gradients(
-            lambda way: curvature(way) + rough * model.field.penalty(way) + floor * way,
-            -(gradient + rough * model.field.penalty(nodes)),
+            lambda way: curvature(way) + model.field.penalty(way, rough) + floor * way,
+            -(gradient + model.field.penalty(nodes, rough)),
             steps=steps,
             least=SMALL_REST,
             inverse=inverse,

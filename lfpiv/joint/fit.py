@@ -100,7 +100,7 @@ def fit_pair(
         if now.fresh:
             light = Light(model.start(found, nodes))
         light = steps.epochs(light, model.transports(nodes), now.epochs)
-        step = movement.step(light.values, nodes, now.relaxation, now.steps)
+        step = movement.step(light.values, nodes, now.relaxation, now.steps, settled=not now.relaxation > 1)
         nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
         done += 1
         moved = float(np.abs(model.field.values(step.change)).mean())

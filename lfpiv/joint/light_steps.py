@@ -109,7 +109,8 @@ class LightSteps:
         The frame's light (z, y, x) follows the steps, blurred as the spline will blur the sum.
         """
         stored, partition, equations = self._stored, self.partitions[frame], self.model.frames[frame].equations
-        light, share = to_device(stored.store(moved), float), SHARPENING if self.model.sieve_voxel > 0 else 0.0
+        light = to_device(stored.store(moved), float)
+        share = SHARPENING if isinstance(partition.steps[0], SharpenedStep) else 0.0
         total, below = zeros(stored.size), zeros(stored.size)
         with equations.locked():
             equations.begin()

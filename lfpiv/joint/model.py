@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv.joint.spline_field import SplineField
+from lfpiv.joint.spline_field import SPACING_VOXEL, SplineField
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import TRUNCATE, Sieve, coefficients
@@ -52,7 +52,7 @@ class JointModel:
 
     def __init__(self, weights: Weights, frames: Sequence[PreparedFrame]):
         self.weights, self.frames = weights, tuple(frames)
-        self.field = SplineField(weights.grid)
+        self.field = SplineField(weights.grid, SPACING_VOXEL * weights.volume.voxel_mm / weights.grid.voxel_mm)
         self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel
         light = [
             sum(float(one.image.sum(dtype=np.float64)) / one.camera_gain for one in frame.images.values())

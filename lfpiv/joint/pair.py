@@ -22,7 +22,6 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.joint.fit import JointFit, fit_pair
 from lfpiv.joint.model import JointModel
-from lfpiv.joint.spline_field import SPACING_VOXEL
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings
@@ -50,7 +49,7 @@ class Estimate(enum.Enum):
 
     ALONE = "each frame reconstructed by itself"
     JOINT = "both frames fitted together with the displacement"
-    TOO_THIN = "the volume is thinner than the distance of the displacement's nodes, 8 reconstructed voxels"
+    TOO_THIN = "the volume is thinner than the distance of the displacement's nodes, 8 voxels"
     NOT_STARTED = "too few valid vectors to start a joint fit: look at windows, seeding and displacements"
 
 
@@ -97,8 +96,9 @@ class PairSolver:
         The operator. The joint fit starts from vectors between volumes on its attribute ``volume``.
     settings : SmartSettings
         Settings of the reconstruction.
-    estimate : {"correlation", "joint"}
-        Whether each frame is reconstructed by itself, or both are fitted together.
+    estimate : {"auto", "correlation", "joint"}
+        Whether each frame is reconstructed by itself, or both are fitted together; "auto" fits them together where
+        there are two or more cameras.
     correlation : mapping, optional
         Settings of `correlate`, which gives the first displacement; default: those of an experiment without such a
         table.
@@ -117,12 +117,13 @@ class PairSolver:
         estimate: str = Smart().estimate,
         correlation: Mapping[str, Any] | None = None,
     ):
-        if estimate not in ("correlation", "joint"):
-            raise ValueError(f"estimate: expected 'correlation' or 'joint', got {estimate!r}.")
-        if estimate == "joint" and len(weights.cameras) < 2:
+        if estimate not in ("auto", "correlation", "joint"):
+            raise ValueError(f"estimate: expected 'auto', 'correlation' or 'joint', got {estimate!r}.")
+        several = len(weights.cameras) > 1
+        if estimate == "joint" and not several:
             raise ValueError("estimate: 'joint' needs two or more cameras, got one; use 'correlation'.")
         self.smart = SmartSolver(weights, settings)
-        self.estimate = estimate
+        self.is_joint = estimate == "joint" or (estimate == "auto" and several)
         self.correlation = Correlation().model_dump() if correlation is None else dict(correlation)
 
     def solve(
@@ -144,7 +145,7 @@ class PairSolver:
             raise ValueError(f"images, floor: expected two frames, got {len(images)} and {len(floors)}.")
         if len(masks) != 2:
             raise ValueError(f"mask: expected one for both frames, or two, got {len(masks)}.")
-        alone = ALONE_SHARE if self.estimate == "joint" else 1.0
+        alone = ALONE_SHARE if self.is_joint else 1.0
 
         def step(start: float, end: float, fraction: float) -> None:
             if progress is not None:
@@ -161,7 +162,7 @@ class PairSolver:
             found.append(one)
         both = (found[0], found[1])
         result = PairResult(frames=both, unshared=both, estimate=Estimate.ALONE)
-        if self.estimate == "joint":
+        if self.is_joint:
             result = self._joint(prepared, result, partial(step, alone, 1.0))
         step(0.0, 1.0, 1.0)
         return result
@@ -171,7 +172,8 @@ class PairSolver:
     ) -> PairResult:
         """Return the joint fit that starts from the frames by themselves, or these if it cannot be better."""
         weights = self.smart.weights
-        if min(weights.grid.shape) < SPACING_VOXEL:
+        model = JointModel(weights, prepared)
+        if min(weights.grid.shape) < model.field.spacing_voxel:
             return replace(alone, estimate=Estimate.TOO_THIN)
         volumes = [volume_on(frame.to_dataarray(), weights.volume) for frame in alone.frames]
         with collected(quiet=True):
@@ -179,7 +181,6 @@ class PairSolver:
         if float(vectors.attrs["valid_fraction"]) < LEAST_VALID * float(vectors.attrs["measurable_fraction"]):
             log.warning("joint fit: %.0f %% of the vectors are valid; %s", *_share(vectors))
             return replace(alone, estimate=Estimate.NOT_STARTED)
-        model = JointModel(weights, prepared)
         fit = fit_pair(model, alone.frames, model.field.fitted_to(vectors), progress)
         log.info("joint fit: %d rounds, misfit %.2f of the frames by themselves", fit.rounds, fit.misfit_ratio)
         frames = []
@@ -219,9 +220,9 @@ def reconstruct_pair(
         The operator.
     images : sequence of two mappings of str to ndarray
         Images of the first and the second frame, each as `reconstruct` takes them.
-    estimate : {"correlation", "joint"}
+    estimate : {"auto", "correlation", "joint"}
         "correlation" reconstructs each frame by itself. "joint" fits one volume midway in time and its displacement to
-        the images of both frames; it needs two or more cameras.
+        the images of both frames; it needs two or more cameras. "auto" takes "joint" where there are so many.
     floor : sequence of two
         Noise floor of each frame's images, as `reconstruct` takes it.
     correlation : mapping, optional

@@ -17,8 +17,8 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.joint.conjugate_gradients import conjugate_gradients
 from lfpiv.velocity.settings import CorrelationSettings
 
-SPACING_VOXEL = 8.0
-"""Distance of the nodes [voxel]."""
+SPACING_VOXEL = 7.0
+"""Distance of the nodes [voxel of the measured volume]."""
 ROUGH_START = 0.02
 """Weight of the squared second differences of the nodes in a fit to vectors, each of which has a weight of 1."""
 REPLACED = 0.2
@@ -36,11 +36,13 @@ class SplineField:
     ----------
     grid : Grid
         Voxels midway in time.
+    spacing_voxel : float
+        Distance of the nodes [voxel of the grid].
     """
 
-    def __init__(self, grid: Grid):
-        self.grid = grid
-        self._cells = [max(1, round((n - 1) / SPACING_VOXEL)) for n in grid.shape]
+    def __init__(self, grid: Grid, spacing_voxel: float = SPACING_VOXEL):
+        self.grid, self.spacing_voxel = grid, spacing_voxel
+        self._cells = [max(1, round((n - 1) / spacing_voxel)) for n in grid.shape]
         self.count = tuple(cells + 3 for cells in self._cells)
         """Nodes along each axis."""
         self._rough = []
@@ -83,12 +85,21 @@ class SplineField:
         found: np.ndarray = (_along_axes(matrices, nodes) * (own.voxel_mm / grid.voxel_mm)).astype(np.float32)
         return found
 
-    def penalty(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the gradient of half the sum of the squared second differences along each axis."""
+    def penalty(self, nodes: np.ndarray, weights: np.ndarray | float = 1.0) -> np.ndarray:
+        """Return the gradient of half the sum of the squared second differences along each axis.
+
+        `weights` of a component along an axis have the shape (3, 3), or are one number.
+        """
+        weights = np.broadcast_to(weights, (3, 3))[..., None, None, None]
         z, y, x = self._rough
-        total: np.ndarray = np.einsum("ab,ibcd->iacd", z, nodes)
-        total = total + np.einsum("bc,iacd->iabd", y, nodes) + np.einsum("cd,iabd->iabc", x, nodes)
+        total: np.ndarray = weights[:, 0] * np.einsum("ab,ibcd->iacd", z, nodes)
+        total = total + weights[:, 1] * np.einsum("bc,iacd->iabd", y, nodes)
+        total = total + weights[:, 2] * np.einsum("cd,iabd->iabc", x, nodes)
         return total
+
+    def bends(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the mean squared second differences of each component along each axis, shape (3, 3)."""
+        return np.stack([(np.diff(nodes, 2, axis=axis) ** 2).mean((1, 2, 3)) for axis in (1, 2, 3)], 1)
 
     def fitted_to(self, vectors: xr.Dataset) -> np.ndarray:
         """Return smooth nodes whose means over the windows are the vectors, so that windows do not damp the field.

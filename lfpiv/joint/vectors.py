@@ -98,7 +98,7 @@ class Evidence:
     """What the frames by themselves say about a fitted displacement, of each vector; shapes (z, y, x, 3) [voxel]."""
 
     fitted: np.ndarray
-    """Mean of the fitted displacement over the window."""
+    """Mean of the fitted displacement over the fluid in the window; 0 without fluid."""
     left: np.ndarray
     """Displacement that is left between the frames by themselves."""
     scatter: np.ndarray
@@ -119,17 +119,19 @@ def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequenc
     settings = CorrelationSettings.of(vectors)
     window, edges = settings.windows[-1], np.asarray(vectors.attrs["voxel_mm"], float)
     moved = np.stack([volumes[0][MOVED[axis]].values for axis in AXES], -1)
-    fitted = moved.astype(float)
+    solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
+    fluid = np.ones((*moved.shape[:3], 1)) if solid is None else ~solid[..., None]
+    fitted, part = moved * fluid.astype(float), fluid.astype(float)
     for axis, name in enumerate(AXES):
         share = window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
-        fitted = np.moveaxis(np.tensordot(share, fitted, (1, axis)), 0, axis)
+        fitted, part = (np.moveaxis(np.tensordot(share, one, (1, axis)), 0, axis) for one in (fitted, part))
+    fitted = np.divide(fitted, part, out=np.zeros_like(fitted), where=part > 0)
     missing = missing_smoothing(settings.smoothing_voxel, *alone)
     first, second = (
         preprocess((one.values - np.median(one.values)).astype(np.float32), missing, settings.intensity_power)
         for one in alone
     )
     shape = triple(first.shape)
-    solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
     (first, second), _ = UndeformedPair((first, second), solid).deformed(_predictor(moved), window)
     step = triple(
         round((at[1] - at[0]) / edge) if len(at) > 1 else n

@@ -141,7 +141,7 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
         free=shutil.disk_usage(run.folder.path if stored else Path.cwd()).free,
     )
     pair = sum(first.steps.values(), Cost())
-    simulated = experiment.bootstrap.count(pairs)
+    simulated = experiment.simulated_of(pairs)
     again = pair * (simulated + 1 if simulated else 0)
     total = sum(first.prepared.values(), Cost()) + first.once + pair * math.ceil(pairs / workers) + again
     step(1.0)

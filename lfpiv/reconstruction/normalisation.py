@@ -27,7 +27,7 @@ from lfpiv.reconstruction.ordered_subsets import (
 )
 from lfpiv.reconstruction.settings import AUTO, SmartSettings
 from lfpiv.reconstruction.sieve import Sieve
-from lfpiv.reconstruction.steps import SharpenedStep, SmartStep, Step
+from lfpiv.reconstruction.steps import LEAST_SHARPENED_VOXEL, SharpenedStep, SmartStep, Step
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
@@ -118,7 +118,7 @@ class Normalisation:
             pixels = self._weights.stored.store(self._weights.affected_pixels)
             size = unblurred = self._quotient(relaxation / self._weights.largest, pixels, self._lit & (pixels > 0))
         plain = SmartStep(size, self.sieve)
-        sharpened = self._settings.accelerate and self.sieve.sigma_voxel > 0
+        sharpened = self._settings.accelerate and self.sieve.sigma_voxel >= LEAST_SHARPENED_VOXEL
         return (SharpenedStep(unblurred, self.sieve), plain) if sharpened else (plain,)
 
     def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
@@ -173,7 +173,7 @@ class LensSubsets(Normalisation):
         mu = np.float32(self._settings.relaxation)
         on_device = [to_device(mu * size, float) for size in sizes]
         plain = tuple(SmartStep(size, self.sieve) for size in on_device)
-        if self.sieve.sigma_voxel == 0:
+        if self.sieve.sigma_voxel < LEAST_SHARPENED_VOXEL:
             return Partition(subsets, plain, conflict=conflict)
         sharpened = tuple(SharpenedStep(size, self.sieve) for size in on_device)
         return Partition(subsets, sharpened, plain, conflict=conflict)
@@ -253,7 +253,7 @@ class RowSubsets(Normalisation):
         lengths, excess = derived[key]
         size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
         plain = (SmartStep(size, self.sieve),) * len(subsets)
-        if self.sieve.sigma_voxel == 0:
+        if self.sieve.sigma_voxel < LEAST_SHARPENED_VOXEL:
             return Partition(subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
         sharpened = (SharpenedStep(size, self.sieve),) * len(subsets)
         return Partition(subsets, sharpened, plain, lengths, JOINT_CONFLICT)

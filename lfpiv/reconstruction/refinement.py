@@ -24,8 +24,8 @@ LARGEST_PART = 40
 """Largest edge of the part of a volume whose weights measure the particles' size [voxel]."""
 RESOLVED = 0.93
 """Least size of particles that voxels describe well, standard deviation [reconstructed voxel]."""
-LARGEST = 1.35
-"""Largest refinement that is asked for: 2.5 times as many voxels."""
+LARGEST = 2.0
+"""Largest refinement that is asked for: eight times as many voxels."""
 STEP = 0.05
 """Refinements are rounded to multiples of this."""
 

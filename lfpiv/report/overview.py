@@ -146,9 +146,10 @@ def _orientation(camera: CameraSetup) -> str:
 
 def _joint(summary: Summary) -> str:
     """State how many pairs were fitted jointly and how many of their vectors; empty without a joint fit."""
-    fits = [pair.joint for pair in summary.pairs if pair.joint is not None and pair.joint.fitted]
-    if summary.settings["smart"].get("estimate") != "joint":
+    tried = [pair.joint for pair in summary.pairs if pair.joint is not None]
+    if not tried:
         return ""
+    fits = [joint for joint in tried if joint.fitted]
     text = f"{markup.count(len(fits), 'pair')} of {len(summary.pairs):,}"
     if fits:
         share, ratio = np.mean([fit.share for fit in fits]), np.median([fit.misfit_ratio for fit in fits])

@@ -64,7 +64,8 @@ def decide(
     """
     if not experiment.simulated_pairs:
         if experiment.bootstrap.pairs:
-            log.info("damping by ghosts: not measured in so short a run; set bootstrap.pairs")
+            why = "since a joint fit hardly damps" if experiment.is_joint else "in so short a run"
+            log.info("damping by ghosts: not measured %s; set bootstrap.pairs to measure it", why)
         with writing(folder.bootstrap):
             folder.bootstrap.unlink(missing_ok=True)
         return None

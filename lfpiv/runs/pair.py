@@ -86,7 +86,7 @@ class PairWork(FrameWork):
         """Return the frames of pairs to come, of which none is known yet."""
         if self.experiment.in_sequence:
             return FollowedFrames(self, stored)
-        return JointFrames(self) if self.experiment.smart.estimate == "joint" else Frames(self, stored)
+        return JointFrames(self) if self.experiment.is_joint else Frames(self, stored)
 
     def _compute(self, pair: int, frames: Frames, progress: StepProgress) -> Computed:
         """Compute the results of one pair and start to write them."""

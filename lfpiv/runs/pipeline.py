@@ -172,16 +172,16 @@ def correlate(
     with open_run(experiment, out, device, progress, pairs) as current:
         calibrated = rig.load_calibration(current)
         pending = current.unfinished(particles=False)
-        if (known := pending.ahead()) and not current.has_some_volumes():
+        if (known := pending.ahead()) and current.experiment.by_links:
+            raise InputError(
+                f"{current.experiment.path}: tracking.vectors takes the vectors from linked particles, which are found "
+                'in the images, not in volumes. Use `lfpiv run`, or set tracking.vectors = "correlation".'
+            )
+        if known and not current.has_some_volumes():
             first = known[0]
             raise InputError(
                 f"{current.folder.volume(first, 0)}: expected the two volumes of {current.experiment.name_of(first)} "
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
-            )
-        if known and current.experiment.by_links:
-            raise InputError(
-                f"{current.experiment.path}: tracking.vectors takes the vectors from linked particles, which are found "
-                'in the images, not in volumes. Use `lfpiv run`, or set tracking.vectors = "correlation".'
             )
         if known:
             rig.tell_vectors(current.experiment)

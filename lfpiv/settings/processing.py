@@ -52,10 +52,10 @@ class Smart(Table):
     follows from the particles' size in the images, and is 1 where they are large enough."""
     tolerance: Annotated[float, Field(strict=True, ge=0, lt=1)] = 5e-4
     """Relative decrease of the misfit per iteration below which SMART stops; 0 runs all iterations."""
-    estimate: Literal["correlation", "joint"] = "correlation"
+    estimate: Literal["auto", "correlation", "joint"] = "auto"
     """How the displacement of an image pair is estimated: from the correlation of two volumes, each reconstructed from
-    its own images, or by a fit of one volume and its displacement to the images of both frames, which needs two or more
-    cameras."""
+    its own images, or by a joint fit of one volume and its displacement to the images of both frames, which needs two
+    or more cameras and three to four times the time. "auto" takes the joint fit where it can be used."""
     predict: Flag = False
     """Whether an instant of a time series starts from the one before, moved by the flow, and is corrected by those
     beside it; it takes fewer iterations."""
@@ -178,7 +178,8 @@ class Bootstrap(Table):
 
     pairs: Annotated[int, Field(strict=True, ge=0, le=bounds.MOST)] | Literal["auto"] = "auto"
     """Number of pairs that are simulated after a pilot, each at the cost of a recorded pair; "auto" takes one for ten
-    recorded pairs, the pilot included, at most 12 and none in runs of fewer than 20 pairs, 0 measures nothing."""
+    recorded pairs, the pilot included, at most 12, none in runs of fewer than 20 pairs and none with a joint fit, which
+    hardly damps; 0 measures nothing."""
 
     def count(self, pairs: int) -> int:
         """Return the number of simulated pairs for a number of recorded ones."""

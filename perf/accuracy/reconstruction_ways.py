@@ -100,6 +100,7 @@ def by_joint_fit(rig: Rig, recorded: Recorded, settings: Mapping[str, Any]) -> M
     """Fit one volume and one displacement to both frames, as `lfpiv run` does with ``smart.estimate = "joint"``."""
     smart = Smart(**table_of(settings, "smart") | {"estimate": "joint"})
     weights, factor = _weights_of_run(rig, recorded, smart, settings.get("volume.guard_mm", "auto"))
+    weights.volume = rig.grid
     solver = PairSolver(weights, SmartSettings(**smart.of_one_frame(factor)), estimate=smart.estimate)
     start = time.process_time()
     found = solver.solve(*zip(*_light_and_noise(rig, recorded), strict=True)).to_dataarrays(rig.grid)

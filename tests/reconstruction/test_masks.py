@@ -77,7 +77,7 @@ def test_a_mask_is_given_as_flags_numbers_or_with_coordinates(recorded):
 def test_each_frame_of_a_pair_may_have_its_own_mask(recorded):
     weights, solid, images = recorded
     masks = (solid, np.roll(solid, 1, axis=2))
-    pair = plain_steps.reconstruct_pair(weights, images, iterations=4, mask=masks)
+    pair = plain_steps.reconstruct_pair(weights, images, estimate="correlation", iterations=4, mask=masks)
     for volume, mask, frame in zip(pair, masks, images, strict=True):
         alone = plain_steps.reconstruct(weights, frame, iterations=4, mask=mask)
         np.testing.assert_array_equal(volume["masked"].values, mask)

@@ -30,7 +30,8 @@ def images_of(rig, sigma_voxel, seed, count=80):
 
 
 @pytest.mark.parametrize(
-    ("size", "factor"), [(None, 1.0), (0.0, LARGEST), (0.5, LARGEST), (0.75, 1.25), (0.93, 1.0), (1.5, 1.0)]
+    ("size", "factor"),
+    [(None, 1.0), (0.0, LARGEST), (0.4, LARGEST), (0.5, 1.85), (0.75, 1.25), (0.93, 1.0), (1.5, 1.0)],
 )
 def test_small_particles_need_finer_voxels(size, factor):
     assert needed_refinement(size) == factor

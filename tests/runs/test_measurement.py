@@ -55,11 +55,10 @@ def test_each_pair_and_its_volumes_are_those_of_the_run(small_run, rig):
 
 
 def test_the_long_form_gives_the_same(rig):
-    volumes = []
-    for light in rig.light(1):
-        volume = lfpiv.reconstruct(rig.weights, light.images, floor=light.noise, **rig.smart)
-        volumes.append(lfpiv.volume_on(volume, rig.experiment.grid))
-    vectors = lfpiv.correlate(*volumes, dt_s=rig.experiment.dt_s, **rig.correlation)
+    light, grid = rig.light(1), rig.experiment.grid
+    images, floor = [one.images for one in light], [one.noise for one in light]
+    volumes = lfpiv.reconstruct_pair(rig.weights, images, floor=floor, grid=grid, **rig.smart)
+    vectors = lfpiv.joint_vectors(volumes, dt_s=rig.experiment.dt_s, **rig.correlation)
     assert_same(lfpiv.measure_pair(rig, 1), vectors)
 
 

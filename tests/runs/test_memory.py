@@ -78,16 +78,18 @@ def test_without_control_groups_the_machine_alone_counts(tmp_path, monkeypatch):
 
 def test_a_sequence_holds_the_instants_between_those_of_a_pair(small_run):
     experiment = read_experiment(small_run.experiment)
-    predicting = experiment.smart.model_copy(update={"predict": True})
+    alone = experiment.smart.model_copy(update={"estimate": "correlation"})
+    predicting = alone.model_copy(update={"predict": True})
 
     def needed(step, smart):
         recording = Recording() if step is None else Recording.of_series(40, step=step)
         return memory.worker_bytes(dataclasses.replace(experiment, recording=recording, smart=smart))
 
-    assert needed(None, predicting) == needed(None, experiment.smart) == needed(8, experiment.smart)
+    assert needed(None, predicting) == needed(None, alone) == needed(8, alone)
     pixels = sum(math.prod(camera.optics.sensor_shape) for camera in experiment.cameras)
     assert needed(8, predicting) - needed(1, predicting) == 7 * 4 * (experiment.grid.size + pixels)
-    assert needed(1, predicting) > needed(1, experiment.smart)
+    assert needed(1, predicting) > needed(1, alone)
+    assert needed(None, experiment.smart) > needed(None, alone), "a joint fit holds more volumes"
 
 
 @pytest.mark.slow

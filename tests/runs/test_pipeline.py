@@ -79,7 +79,7 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
         assert {"sigma_nor_test", "dots_found", "dots_expected", "lens_array_rms_px"} <= set(figures)
         assert 0 < figures["dots_found"] <= figures["dots_expected"] <= 5 * 5 * 3
         assert 0 < figures["network_correction_pitch"] < 0.1  # rendered by an ideal lens: hardly anything is left
-    assert [len(pair["residual"]["a"]) for pair in summary["pairs"]] == [9] * PAIRS and summary["failed"] == []
+    assert [len(pair["residual"]["a"]) for pair in summary["pairs"]] == [10] * PAIRS and summary["failed"] == []
     for figure in ("structure", "camera_gain", "light_outside"):
         assert all(set(pair[figure]["b"]) == {"left", "right"} for pair in summary["pairs"])
     assert all(max(pair["camera_gain"]["a"].values()) == 1 for pair in summary["pairs"])
@@ -129,17 +129,18 @@ def test_only_what_changed_is_done_anew(finished, tmp_path, caplog):
     """Other windows: vectors from the volumes that are there. Pairs not asked for stay, outside the summary."""
     experiment, out, _ = finished
     files = {path: path.stat().st_mtime_ns for path in out.rglob("*.[hn][5c]")}
-    file = changed(experiment, tmp_path, "[correlation]", "[correlation]\nmax_displacement_voxel = 3.0")
+    file = changed(experiment, tmp_path, "[correlation]", "[correlation]\nsmoothing_voxel = 0.6")
     with caplog.at_level("INFO", "lfpiv"):
         summary = pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)
     redone = {path for path, time in files.items() if path.stat().st_mtime_ns != time}
     assert redone == {out / "vectors" / "pair_0000.nc"}
-    assert "correlation.max_displacement_voxel changed: pair 0 made again" in caplog.text
+    assert "correlation.smoothing_voxel changed: pair 0 made again" in caplog.text
     assert [pair["pair"] for pair in summary["pairs"]] == [0] and summary["timings_s"]["weights"] > 0
 
 
 EDITS = {
-    "correlation": ("[correlation]", "[correlation]\nmax_displacement_voxel = 2.5", "vectors"),
+    "correlation": ("[correlation]", "[correlation]\nsmoothing_voxel = 0.6", "vectors"),
+    "search": ("[correlation]", "[correlation]\nmax_displacement_voxel = 2.5", "vectors, volumes"),
     "time between frames": ("dt_s = 0.001", "dt_s = 0.002", "vectors"),
     "smart": ("iterations = 8", "iterations = 9", "vectors, volumes"),
     "voxels": ("voxel_mm = 0.1", "voxel_mm = 0.09", "vectors, volumes"),
@@ -244,7 +245,7 @@ def test_a_failure_leaves_no_part_and_no_other_pair_undone(small_run, tmp_path, 
     def fail(volumes, **settings):
         if volumes[0].attrs["pair"] == 1:
             raise RuntimeError("the power went off")
-        return lfpiv.correlate(*volumes, **settings)
+        return lfpiv.joint_vectors(volumes, **settings)
 
     monkeypatch.setattr("lfpiv.runs.pair_vectors.joint_vectors", fail)
     monkeypatch.setattr(netcdf, "read_volume", numbered(netcdf.read_volume))

@@ -17,6 +17,7 @@ from support.series_run import FIRST, chained, changed, in_processes, make_work,
 from support.small_run import PAIRS, damage, same_vectors
 from xarray.testing import assert_equal
 
+import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
@@ -136,8 +137,11 @@ def test_several_workers_reconstruct_each_instant_once_with_equal_numbers(
 
 
 def test_vectors_are_those_of_the_same_images_as_pairs(small_run, reference):
+    experiment = read_experiment(small_run.experiment)
+    alone = dataclasses.replace(experiment, smart=experiment.smart.model_copy(update={"estimate": "correlation"}))
+    rig = lfpiv.prepare(alone, lfpiv.load_calibration(small_run.out / "calibration.h5"))
     for pair in range(INSTANTS // 2):
-        one = netcdf.read_vectors(small_run.out / "vectors" / f"pair_{pair:04d}.nc")
+        one = lfpiv.measure_pair(rig, pair)
         other = netcdf.read_vectors(reference / "vectors" / f"instant_{FIRST + 2 * pair:06d}.nc")
         assert_equal(one, other)
 
