@@ -26,8 +26,9 @@ from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.multi_pass import UndeformedPair, peak_ratio
 from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.predictor import CONTROL_SPACING, Predictor
+from lfpiv.velocity.seeding import unseeded_voxels
 from lfpiv.velocity.settings import CorrelationSettings, triple
-from lfpiv.velocity.volume_pair import missing_smoothing, preprocess, solid_voxels, voxel_axes
+from lfpiv.velocity.volume_pair import missing_smoothing, preprocess, solid_voxels, voxel_axes, without
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
@@ -98,7 +99,7 @@ class Evidence:
     """What the frames by themselves say about a fitted displacement, of each vector; shapes (z, y, x, 3) [voxel]."""
 
     fitted: np.ndarray
-    """Mean of the fitted displacement over the fluid in the window; 0 without fluid."""
+    """Mean of the fitted displacement over the part of the window that is fluid and holds particles; 0 without."""
     left: np.ndarray
     """Displacement that is left between the frames by themselves."""
     scatter: np.ndarray
@@ -120,8 +121,10 @@ def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequenc
     window, edges = settings.windows[-1], np.asarray(vectors.attrs["voxel_mm"], float)
     moved = np.stack([volumes[0][MOVED[axis]].values for axis in AXES], -1)
     solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
-    fluid = np.ones((*moved.shape[:3], 1)) if solid is None else ~solid[..., None]
-    fitted, part = moved * fluid.astype(float), fluid.astype(float)
+    empty = unseeded_voxels([one.values for one in alone], solid)
+    dry = without(solid, None if empty is None else ~empty)
+    part = np.ones((*moved.shape[:3], 1)) if dry is None else (~dry[..., None]).astype(float)
+    fitted = moved * part
     for axis, name in enumerate(AXES):
         share = window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
         fitted, part = (np.moveaxis(np.tensordot(share, one, (1, axis)), 0, axis) for one in (fitted, part))

@@ -10,7 +10,7 @@ import lfpiv
 from lfpiv import metrics
 from lfpiv.joint.field import WIDENED
 from lfpiv.joint.pair import MOVED, UNSHARED, Estimate, PairSolver
-from lfpiv.joint.vectors import joint_vectors
+from lfpiv.joint.vectors import compare, joint_vectors
 from lfpiv.simulation.flows import Swirl, window_mean
 
 GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.2, 2.0), voxel_mm=0.1)
@@ -113,6 +113,22 @@ def test_a_displacement_that_the_frames_contradict_is_not_taken(fitted):
     assert not vectors["joint"].values[..., left].any() and sound["joint"].values[..., left].mean() > 0.5
     own = lfpiv.correlate(*(volume.copy(data=volume[UNSHARED].values) for volume in volumes), **CORRELATION)
     np.testing.assert_array_equal(vectors["displacement_x"].values[..., left], own["displacement_x"].values[..., left])
+
+
+def test_a_vector_is_the_mean_over_the_fluid_in_its_window(fitted):
+    """Beside a wall the fit has no images to follow, so its displacement there counts in no mean."""
+    volumes, wall = fitted[0], 9
+    solid = np.broadcast_to(np.arange(GRID.shape[2]) < wall, GRID.shape)
+    masked = [volume.assign_coords(masked=(volume.dims, solid)) for volume in volumes]
+    alone = [volume.copy(data=np.where(solid, 0, volume[UNSHARED].values).astype("f4")) for volume in masked]
+    ramp = 0.01 * np.broadcast_to(np.arange(GRID.shape[2], dtype="f4"), GRID.shape)
+    masked[0] = masked[0].assign_coords({MOVED["x"]: (volumes[0].dims, np.where(solid, 5, ramp).astype("f4"))})
+    vectors = lfpiv.correlate(*alone, **CORRELATION)
+    found = compare(vectors, masked, alone).fitted[..., 2]
+    for column, centre in enumerate((vectors["x"].values - GRID.axis_mm(2)[0]) / GRID.voxel_mm):
+        part = np.clip((WINDOWS[-1] + 1) / 2 - np.abs(np.arange(GRID.shape[2]) - centre), 0, 1) * ~solid[0, 0]
+        np.testing.assert_allclose(found[..., column], (ramp[0, 0] * part).sum() / part.sum(), rtol=1e-5)
+    assert 0 < vectors["fluid_share"].values.min() < 1, "a window beside the wall"
 
 
 def test_frames_by_themselves_are_correlated_as_ever(weights, pair):
