@@ -74,7 +74,7 @@ SIGNIFICANCE = 5.0
 """Least ratio of the covariance to its standard error over the sub-apertures. Below it noise hides the particles."""
 VOXEL_VARIANCE = 1 / 12
 """Variance of an evenly lit voxel along each axis [voxel^2]."""
-LEAST_SIEVE_VOXEL = 0.6
+LEAST_SIEVE_VOXEL = 0.5
 """Least standard deviation of a sieve that is chosen [voxel]. Particles that are narrower are well single voxels."""
 SIEVE_STEP_VOXEL = 0.05
 """Sieves are rounded to multiples of this [voxel], so that the frames of a run have the same sieve."""

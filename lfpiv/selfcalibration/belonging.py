@@ -22,6 +22,9 @@ from lfpiv.weights.operator import Weights
 
 ITERATIONS = 3
 """SMART iterations of a set of images."""
+FREE, SIEVE_VOXEL = 1.4, 0.4
+"""Refinement of the voxels from which a sieve makes the volume as smooth as coarser voxels do, and its standard
+deviation [voxel of the measured volume]: a volume that varies freely explains also images that do not belong."""
 PART_LENSES = 3.0
 """Edge of the parts of a sensor [microlens pitch]: the light of a particle hardly reaches farther."""
 TURN_LENSES = 3
@@ -135,7 +138,9 @@ class ImageFit:
 
     def __init__(self, weights: Weights):
         self.weights = weights
-        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **PLAIN))
+        finer = weights.volume.voxel_mm / weights.grid.voxel_mm
+        sieve = SIEVE_VOXEL * finer if finer > FREE else 0.0
+        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **(PLAIN | {"sieve_voxel": sieve})))
         self._parts = {name: self._parts_of(name) for name in weights.cameras}
 
     def unexplained(self, images: Images, turn: str | None = None) -> np.ndarray:

@@ -31,15 +31,18 @@ def finished(small_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_lost_volume_of_an_image_pair_is_reconstructed_by_itself(small_run, tmp_path, monkeypatch):
-    out, found, frame = small_run.results(tmp_path / "out"), [], Reconstructor.frame
+def test_a_lost_volume_of_an_image_pair_is_fitted_again(small_run, tmp_path, monkeypatch):
+    """The joint fit takes both frames; the volume that is there stays."""
+    out, found, pair = small_run.results(tmp_path / "out"), [], Reconstructor.pair
+    kept = (out / "volumes/pair_0001_a.nc").stat().st_mtime_ns
     for lost in ("volumes/pair_0001_b.nc", "vectors/pair_0001.nc"):
         (out / lost).unlink()
     monkeypatch.setattr(
-        Reconstructor, "frame", lambda self, light, step: found.append(light.frame.label) or frame(self, light, step)
+        Reconstructor, "pair", lambda self, both, step: found.append(both[1].frame.label) or pair(self, both, step)
     )
     pipeline.run(small_run.experiment, out, keep_volumes=True)
     assert found == ["pair 1, frame b"] and same_vectors(small_run.out, out) == PAIRS
+    assert (out / "volumes/pair_0001_a.nc").stat().st_mtime_ns == kept
 
 
 @pytest.mark.slow

@@ -218,7 +218,7 @@ def test_a_run_with_counted_weights_measures_the_same_vectors(small_run, tmp_pat
     experiment.write_text(experiment.read_text() + '\n[compute]\nweights = "count"\n')
     summary = pipeline.run(experiment, out, device=device.kind, pairs=(0, 1))
     assert summary["weights"]["method"] == "count"
-    assert 0.1 < np.mean(summary["weights"]["count_check_l2"]) < NOISE[4096]
+    assert 0.05 < np.mean(summary["weights"]["count_check_l2"]) < NOISE[4096]  # footprints differ by some 0.01
     apart = []
     for path in sorted((out / "vectors").iterdir()):
         found, known = (
