@@ -181,11 +181,17 @@ class Experiment(Shown):
         return list(dict.fromkeys(self.mask.file_of(frame.fields) for frame in frames))
 
     @property
+    def estimate(self) -> Literal["correlation", "joint"]:
+        """How displacements are estimated: as stated, or with "auto" by a joint fit where it can be used."""
+        if self.smart.estimate != "auto":
+            return self.smart.estimate
+        usable = len(self.cameras) > 1 and not self.recording.is_series and not self.by_links
+        return "joint" if usable else "correlation"
+
+    @property
     def is_joint(self) -> bool:
         """Whether both frames of a pair are fitted together with their displacement."""
-        if self.smart.estimate == "auto":
-            return len(self.cameras) > 1 and not self.recording.is_series and not self.by_links
-        return self.smart.estimate == "joint"
+        return self.estimate == "joint"
 
     @property
     def in_sequence(self) -> bool:

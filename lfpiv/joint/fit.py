@@ -35,6 +35,11 @@ class Round:
     relaxation: float
     """Factor of the displacement's step: the light hides a part of it."""
 
+    @property
+    def settled(self) -> bool:
+        """Whether the displacement is near enough to its end to set its own prior: steps are not lengthened."""
+        return self.relaxation == 1
+
 
 ROUNDS = (
     Round(True, 1, 3, 1.5),
@@ -100,7 +105,7 @@ def fit_pair(
         if now.fresh:
             light = Light(model.start(found, nodes))
         light = steps.epochs(light, model.transports(nodes), now.epochs)
-        step = movement.step(light.values, nodes, now.relaxation, now.steps, settled=not now.relaxation > 1)
+        step = movement.step(light.values, nodes, now.relaxation, now.steps, settled=now.settled)
         nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
         done += 1
         moved = float(np.abs(model.field.values(step.change)).mean())

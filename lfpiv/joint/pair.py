@@ -22,6 +22,7 @@ from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.resampling import volume_on
 from lfpiv.joint.fit import JointFit, fit_pair
 from lfpiv.joint.model import JointModel
+from lfpiv.joint.spline_field import SPACING_VOXEL
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.settings import SmartSettings
@@ -49,7 +50,7 @@ class Estimate(enum.Enum):
 
     ALONE = "each frame reconstructed by itself"
     JOINT = "both frames fitted together with the displacement"
-    TOO_THIN = "the volume is thinner than the distance of the displacement's nodes, 8 voxels"
+    TOO_THIN = f"the volume is thinner than the distance of the displacement's nodes, {SPACING_VOXEL:g} voxels"
     NOT_STARTED = "too few valid vectors to start a joint fit: look at windows, seeding and displacements"
 
 

@@ -6,7 +6,8 @@ by more than their uncertainty, the vector of their own correlation stays.
 
 The curvature of the misfit is no measure of the error of the fit, since the light was fitted to the same images. The
 uncertainty of the frames by themselves is independent of the fit, which halves it. In simulated pairs twice the
-standard deviation stated holds 92 to 100 % of the errors of a component (docs/notebook/joint.md).
+standard deviation stated holds 84 to 100 % of the errors of a component, and 79 % beside a wall that is not stated
+(docs/notebook/joint.md).
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
     -------
     Dataset
         As `correlate` returns it. ``joint`` is true where the vector is the mean of the fitted displacement over the
-        window, false where the frames by themselves contradict it and their correlation gives the vector.
+        fluid with particles in the window. It is false where the frames by themselves contradict the fit and their
+        correlation gives the vector.
         ``uncertainty_z``, ``_y``, ``_x`` of fitted vectors combine the uncertainty of the frames by themselves, lowered
         as the fit lowers the error, with the displacement that is left between these frames. ``valid`` is taken from
         the correlation of these frames, ``correlation`` and ``peak_ratio`` from the same frames deformed by the fitted

@@ -118,8 +118,12 @@ class Normalisation:
             pixels = self._weights.stored.store(self._weights.affected_pixels)
             size = unblurred = self._quotient(relaxation / self._weights.largest, pixels, self._lit & (pixels > 0))
         plain = SmartStep(size, self.sieve)
-        sharpened = self._settings.accelerate and self.sieve.sigma_voxel >= LEAST_SHARPENED_VOXEL
+        sharpened = self._settings.accelerate and self._may_sharpen
         return (SharpenedStep(unblurred, self.sieve), plain) if sharpened else (plain,)
+
+    @property
+    def _may_sharpen(self) -> bool:
+        return self.sieve.sigma_voxel >= LEAST_SHARPENED_VOXEL
 
     def _quotient(self, numerator: float, denominator: np.ndarray, where: np.ndarray) -> DeviceArray:
         return to_device(np.divide(numerator, denominator, out=np.zeros_like(self._column_sum), where=where), float)
@@ -173,7 +177,7 @@ class LensSubsets(Normalisation):
         mu = np.float32(self._settings.relaxation)
         on_device = [to_device(mu * size, float) for size in sizes]
         plain = tuple(SmartStep(size, self.sieve) for size in on_device)
-        if self.sieve.sigma_voxel < LEAST_SHARPENED_VOXEL:
+        if not self._may_sharpen:
             return Partition(subsets, plain, conflict=conflict)
         sharpened = tuple(SharpenedStep(size, self.sieve) for size in on_device)
         return Partition(subsets, sharpened, plain, conflict=conflict)
@@ -253,7 +257,7 @@ class RowSubsets(Normalisation):
         lengths, excess = derived[key]
         size = self._quotient(self._settings.relaxation, self._column_sum * excess, self._seen)
         plain = (SmartStep(size, self.sieve),) * len(subsets)
-        if self.sieve.sigma_voxel < LEAST_SHARPENED_VOXEL:
+        if not self._may_sharpen:
             return Partition(subsets, plain, lengths=lengths, conflict=POINT_CONFLICT)
         sharpened = (SharpenedStep(size, self.sieve),) * len(subsets)
         return Partition(subsets, sharpened, plain, lengths, JOINT_CONFLICT)

@@ -75,7 +75,7 @@ SIGNIFICANCE = 5.0
 VOXEL_VARIANCE = 1 / 12
 """Variance of an evenly lit voxel along each axis [voxel^2]."""
 LEAST_SIEVE_VOXEL = 0.5
-"""Least standard deviation of a sieve that is chosen [voxel]. Particles that are narrower are well single voxels."""
+"""Least standard deviation of a sieve that is chosen [voxel]. Single voxels describe narrower particles well."""
 SIEVE_STEP_VOXEL = 0.05
 """Sieves are rounded to multiples of this [voxel], so that the frames of a run have the same sieve."""
 

@@ -30,8 +30,8 @@ from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, empty
 
 LEAST_SHARPENED_VOXEL = 0.5
-"""Least standard deviation of a sieve whose steps are sharpened [voxel]. With narrower ones a step makes the finest
-details half as large again, and the misfit of small voxels rises without end."""
+"""Least standard deviation of a sieve whose steps are sharpened [voxel]. Sharpened steps of a narrower sieve enlarge
+the finest details by half. The misfit then diverges on small voxels."""
 SHARPENING = 0.5
 """Share of a correction's fine part that a sharpened step adds to it."""
 SHARPENED_VOXEL = 2.0

@@ -234,7 +234,7 @@ def _of_light(experiment: Experiment, calibration: str, background: str | None) 
         "self_calibration": _self_calibration(experiment),
         "volume": dataclasses.asdict(experiment.grid),
         "mask": _mask(experiment),
-        "smart": experiment.smart.model_dump() | {"estimate": "joint" if experiment.is_joint else "correlation"},
+        "smart": experiment.smart.model_dump() | {"estimate": experiment.estimate},
         "motion": reach if experiment.is_joint or experiment.in_sequence else None,
         "compute": {"weights": compute.weights, "weights_form": compute.weights_form},
         "particles": particles,

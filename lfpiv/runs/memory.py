@@ -72,7 +72,7 @@ def worker_bytes(experiment: Experiment) -> int:
 def _volumes_bytes(experiment: Experiment) -> int:
     """Estimate the memory of a process for what it has of each voxel, but the weights [byte]."""
     each = BYTES_PER_VOXEL + BYTES_PER_VOXEL_AND_CAMERA * len(experiment.cameras)
-    each += JOINT_BYTES * (experiment.is_joint)
+    each += JOINT_BYTES * experiment.is_joint
     return each * experiment.grid.size
 
 

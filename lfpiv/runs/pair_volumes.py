@@ -74,7 +74,7 @@ class Reconstructor:
         return PairSolver(
             self.weights,
             SmartSettings(**smart.of_one_frame(self.refinement)),
-            estimate="joint" if self.experiment.is_joint else "correlation",
+            estimate=self.experiment.estimate,
             correlation=Correlation(max_displacement_voxel=farthest).model_dump(),
         )
 

@@ -54,6 +54,8 @@ class Choice:
     """Parts of a voxel along x, y, z, with the form "pixels"."""
     profile_errors: tuple[float, ...] | None = None
     """Relative L2 error of profiles per counted voxel. None if the form was not chosen by counted rays."""
+    pixel_errors: tuple[float, ...] | None = None
+    """The same of pixels. None if they were not compared, or not chosen."""
 
 
 def choose_forms(
@@ -96,7 +98,9 @@ def choose_form(counted: CountedVoxels) -> Choice:
         "weights of camera %s pixel by pixel differ from counted rays by %.1f %%",
         counted.camera.name, 100 * np.mean(pixels),
     )  # fmt: skip
-    return replace(choice, form="pixels", cuts=cuts) if np.mean(pixels) <= PIXELS_GAIN * np.mean(profiles) else choice
+    if np.mean(pixels) > PIXELS_GAIN * np.mean(profiles):
+        return choice
+    return replace(choice, form="pixels", cuts=cuts, pixel_errors=tuple(pixels))
 
 
 def _tell(counted: CountedVoxels, choice: Choice, alone: Choice) -> None:
@@ -110,7 +114,9 @@ def _tell(counted: CountedVoxels, choice: Choice, alone: Choice) -> None:
             *(name, 100 * np.mean(profiles), 100 * max(profiles)),
             so if choice.form == alone.form else f"{so}, as the other cameras' are",
         )
-    errors = list(profiles or ()) if choice.form == "profiles" else form_errors(counted, choice.form, choice.cuts)
+    errors = profiles if choice.form == "profiles" else choice.pixel_errors
+    if errors is None:
+        errors = tuple(form_errors(counted, choice.form, choice.cuts))
     warn_of_errors(counted, choice.form, errors, requested=False)
 
 
