@@ -81,18 +81,18 @@ def place(small_run, tmp_path_factory):
     experiment = small_run.images(folder / "lfpiv-demo" / "experiment")
     text = experiment.read_text("utf-8")
     experiment.write_text(text.replace("[12, 12, 12]", "[6, 8, 8]"), "utf-8")  # gradients need three vectors along z
-    pipeline.correlate(experiment, folder / "lfpiv-demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lfpiv.report.page.write_report", write_empty_report)
+        pipeline.correlate(experiment, folder / "lfpiv-demo")
     shutil.copytree(folder / "lfpiv-demo", folder / "results", ignore=shutil.ignore_patterns("experiment"))
     shutil.copytree(experiment.parent, folder, dirs_exist_ok=True)
     return folder
 
 
 @pytest.fixture
-def reader(request, place, monkeypatch):
-    """A process in that folder; what a snippet does to plots and logging is undone. Only README.md writes reports."""
+def reader(place, empty_report, monkeypatch):
+    """A process in that folder; what a snippet does to plots and logging is undone."""
     monkeypatch.chdir(place)
-    if request.node.callspec.params["name"] != "README.md":
-        monkeypatch.setattr("lfpiv.report.page.write_report", write_empty_report)
     backend, handlers, level = matplotlib.get_backend(), logging.root.handlers[:], logging.root.level
     matplotlib.use("agg")
     yield place
@@ -104,8 +104,12 @@ def reader(request, place, monkeypatch):
     logging.root.setLevel(level)
 
 
+WITH_PYTHON = [name for name, page in PAGES.items() if any(language == "python" for language, _, _ in blocks(page))]
+WITH_PYTHON.remove("README.md")  # `tests/runs/test_measurement.py` runs its script
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n, page in PAGES.items() if any(b[0] == "python" for b in blocks(page))])
+@pytest.mark.parametrize("name", WITH_PYTHON)
 def test_the_python_of_a_page_runs_from_top_to_bottom(reader, name):
     module = type(sys)("snippets")  # dataclasses look their module up
     sys.modules["snippets"] = module
