@@ -215,7 +215,8 @@ def test_the_setting_offers_what_the_kernel_can():
 @pytest.mark.slow
 def test_a_run_with_counted_weights_measures_the_same_vectors(small_run, tmp_path, device, empty_report):
     experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
-    experiment.write_text(experiment.read_text() + '\n[compute]\nweights = "count"\n')
+    text = experiment.read_text().replace("[smart]\n", "[smart]\nrefinement = 1.0\n")  # a count of few voxels
+    experiment.write_text(text + '\n[compute]\nweights = "count"\n')
     summary = pipeline.run(experiment, out, device=device.kind, pairs=(0, 1))
     assert summary["weights"]["method"] == "count"
     assert 0.05 < np.mean(summary["weights"]["count_check_l2"]) < NOISE[4096]  # footprints differ by some 0.01
