@@ -43,6 +43,7 @@ def test_true_particles_measure_the_flow_and_reversed_ones_its_opposite(tiny):
     assert np.isnan(truth["slope_x"]) and turned["slope_z"] < BACKWARDS < -BACKWARDS < truth["slope_z"]
 
 
+@pytest.mark.slow
 def test_realistic_images_are_harder_and_are_recorded_once(tiny):
     clean, real = (reconstruction_cases.record(Case(condition=name), tiny) for name in ("clean", "real"))
     assert real.light[0].std() > clean.light[0].std() == 0

@@ -351,7 +351,7 @@ def test_an_unfinished_store_with_torn_files_is_finished(tmp_path, torn, monkeyp
     xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
 
 
-@pytest.mark.slow(but="netcdf")
+@pytest.mark.slow
 def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypatch):
     """HDF5 would crash the process. No disk, but files that may not grow: all of them, or only the last bytes."""
     write_run(tmp_path, NUMBERS)

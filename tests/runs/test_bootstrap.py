@@ -108,6 +108,7 @@ def test_readers_take_it_off_vectors_of_the_same_settings_only(small_run, tmp_pa
     assert set(lfpiv.open_results(other)) == set(raw)
 
 
+@pytest.mark.slow
 def test_exported_stores_have_it_and_are_made_anew_when_it_comes(small_run, tmp_path):
     out, _ = with_damping(small_run, tmp_path / "out")
     late = Folder(out).bootstrap.rename(tmp_path / "later")

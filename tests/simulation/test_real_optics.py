@@ -241,6 +241,7 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
     assert (np.abs(found - expected) < 1e-6).mean() > 0.95
 
 
+@pytest.mark.slow(but="all")
 @pytest.mark.parametrize(
     ("scene_camera", "uneven", "noise"),
     [

@@ -108,6 +108,7 @@ def test_few_or_unlinked_particles_leave_the_vectors_as_they_are(correlated):
     assert lfpiv.vectors_from_links(correlated, table(*links(60, 6), found=150)) is correlated
 
 
+@pytest.mark.slow
 def test_many_links_are_solved_in_parts():
     """Parts take the nearest links; their means agree with a solution by all links to a part of the stated error."""
     places, moved, error = links(700, 7)
