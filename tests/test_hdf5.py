@@ -12,7 +12,7 @@ from support.stored import rewrite, small_background, small_calibration
 from support.vector_sets import random_vectors
 
 import lfpiv
-from lfpiv import hdf5
+from lfpiv import hdf5, hdf5_structure
 from lfpiv.errors import DamagedFile
 from lfpiv.results import netcdf
 from lfpiv.runs import background
@@ -195,7 +195,7 @@ def named_type(file):
 
 
 def many(file):
-    for number in range(hdf5.LARGEST_COUNT + 1):
+    for number in range(hdf5_structure.LARGEST_COUNT + 1):
         file.create_group(f"group/{number}")
 
 

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from lfpiv.cli import benchmark, init, interrupts, questions, terminal
+from lfpiv.cli.app import Device, ExperimentFile, Out, Pairs, app, command
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
-from lfpiv.version import __version__
-
-app = typer.Typer(
-    name="lfpiv",
-    help="Multi-camera light-field PIV: raw plenoptic camera images in, 3D velocity volumes out.",
-    invoke_without_command=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
 
 EXIT_S = 15.0
 """Longest time that the process may take to end after its work [s]."""
@@ -32,71 +23,7 @@ EXIT_S = 15.0
 _output = terminal.OUTPUT
 
 
-def _show_version(value: bool) -> None:
-    if value:
-        print(f"lfpiv {__version__}")
-        raise typer.Exit
-
-
-ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The experiment file.")]
-Out = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for everything the run writes.")]
-Pairs = Annotated[
-    str,
-    typer.Option(
-        "--pairs",
-        metavar="A:B",
-        help="Pairs, or instants of a series, A to B - 1 only; either may be left out. One number is a single pair.",
-    ),
-]
-Device = Annotated[
-    Literal["auto", "cpu", "cuda"] | None,
-    typer.Option("--device", help="Where kernels run; default: compute.device of the experiment file."),
-]
-Debug = Annotated[bool, typer.Option("--debug", help="Show debug messages and tracebacks.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show warnings and errors only.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-
-
-@app.callback()
-def _options(
-    context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
-    ] = False,
-    debug: Debug = False,
-) -> None:
-    _output.debug = debug
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-
-
-def _command(
-    name: str, *examples: str, group: typer.Typer = app
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command with examples in its help, and with the options of `_output` after its own."""
-
-    def register(function: Callable[..., None]) -> Callable[..., None]:
-        def command(quiet: Quiet = False, as_json: Json = False, debug: Debug = False, **options: Any) -> None:
-            _output.quiet, _output.json, _output.debug = quiet, as_json, _output.debug or debug
-            try:
-                function(**options)
-            except KeyboardInterrupt as error:
-                raise interrupts.Interrupted from error
-
-        own, common = (inspect.signature(one, eval_str=True) for one in (function, command))
-        parameters = [*own.parameters.values(), *list(common.parameters.values())[:-1]]
-        by_name = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-        command.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]
-        command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        command.__doc__ = function.__doc__
-        epilog = "\b\nExamples:\n" + "\n".join(f"  {example}" for example in examples)  # \b keeps the line breaks
-        group.command(name, epilog=epilog)(command)
-        return function
-
-    return register
-
-
-@_command(
+@command(
     "run",
     "lfpiv run experiment.toml --out results",
     "lfpiv run experiment.toml --out results --pairs 0:100 --workers 2",
@@ -138,7 +65,7 @@ def _run(
     _end(finished)
 
 
-@_command(
+@command(
     "plan",
     "lfpiv plan experiment.toml",
     "lfpiv plan experiment.toml --pairs 10000 --workers 4",
@@ -171,7 +98,7 @@ def _plan(
     _output.show(found.to_json(), lambda: terminal.print_card(found))
 
 
-@_command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {questions.EXAMPLE}")
+@command("init", "lfpiv init", f"lfpiv init jet/experiment.toml {questions.EXAMPLE}")
 @questions.with_options
 def _init(
     experiment: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="The file to write.")] = Path(
@@ -191,7 +118,7 @@ def _init(
     _output.show(result, lambda: terminal.print_init(experiment, written))
 
 
-@_command(
+@command(
     "calibrate", "lfpiv calibrate experiment.toml --out results", "lfpiv calibrate experiment.toml --out results --json"
 )
 def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> None:
@@ -203,7 +130,7 @@ def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> N
     _output.show(summary, lambda: terminal.print_calibration(summary))
 
 
-@_command("check", "lfpiv check experiment.toml --out results")
+@command("check", "lfpiv check experiment.toml --out results")
 def _check(experiment: ExperimentFile, out: Out) -> None:
     """Draw the board as each camera shows it, with arrows along x and y, to be compared with the real board.
 
@@ -219,7 +146,7 @@ def _check(experiment: ExperimentFile, out: Out) -> None:
         raise InputError(found["contradiction"])
 
 
-@_command("preview", "lfpiv preview experiment.toml --out results", "lfpiv preview experiment.toml -o results --pair 7")
+@command("preview", "lfpiv preview experiment.toml --out results", "lfpiv preview experiment.toml -o results --pair 7")
 def _preview(
     experiment: ExperimentFile,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of a run, with its calibration.")],
@@ -239,7 +166,7 @@ def _preview(
     _output.show(found, lambda: terminal.print_preview(found))
 
 
-@_command("reconstruct", "lfpiv reconstruct experiment.toml --out results --pairs 0:10")
+@command("reconstruct", "lfpiv reconstruct experiment.toml --out results --pairs 0:10")
 def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
     """Reconstruct volumes into DIR/volumes."""
     selected = terminal.parse_pairs(pairs)
@@ -251,7 +178,7 @@ def _reconstruct(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", devic
     _end(summary)
 
 
-@_command("correlate", "lfpiv correlate experiment.toml --out results --pairs 0:10")
+@command("correlate", "lfpiv correlate experiment.toml --out results --pairs 0:10")
 def _correlate(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device: Device = None) -> None:
     """Correlate the volumes in DIR/volumes into vectors."""
     selected = terminal.parse_pairs(pairs)
@@ -263,7 +190,7 @@ def _correlate(experiment: ExperimentFile, out: Out, pairs: Pairs = ":", device:
     _end(summary)
 
 
-@_command("report", "lfpiv report experiment.toml --out results")
+@command("report", "lfpiv report experiment.toml --out results")
 def _report(experiment: ExperimentFile, out: Out) -> None:
     """Write summary and report again from the results in DIR."""
     with _output.progress():
@@ -273,7 +200,7 @@ def _report(experiment: ExperimentFile, out: Out) -> None:
     _output.show(summary, lambda: terminal.say(f"report: {out / 'report.html'}"))
 
 
-@_command("export", "lfpiv export results --to vti", "lfpiv export results --to pivpy --depth 1.5 --out planes")
+@command("export", "lfpiv export results --to vti", "lfpiv export results --to pivpy --depth 1.5 --out planes")
 def _export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run: its --out.")],
     to: Annotated[
@@ -312,7 +239,7 @@ def _export(
     _output.show({"files": [str(path) for path in written], "left_out": left_out}, lambda: terminal.say(text))
 
 
-@_command("schema", "lfpiv schema", "lfpiv schema --out schemas")
+@command("schema", "lfpiv schema", "lfpiv schema --out schemas")
 def _schema(out: Out = Path(".")) -> None:
     """Write the JSON Schema of experiment and scene files, by which editors complete and check them.
 
@@ -334,7 +261,7 @@ def _schema(out: Out = Path(".")) -> None:
     )
 
 
-@_command("studio", "lfpiv studio experiment.toml", "lfpiv studio results", "lfpiv studio --no-browser --port 8100")
+@command("studio", "lfpiv studio experiment.toml", "lfpiv studio results", "lfpiv studio --no-browser --port 8100")
 def _studio(
     path: Annotated[
         Path | None,
@@ -352,7 +279,7 @@ def _studio(
         serve(path, port=port, browser=browser, ready=lambda address: terminal.say(f"studio: {address}", flush=True))
 
 
-@_command("simulate", "lfpiv simulate scene.toml --out data")
+@command("simulate", "lfpiv simulate scene.toml --out data")
 def _simulate(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Rig, flow and noise to simulate.")],
     out: Out,
@@ -365,7 +292,7 @@ def _simulate(
     _output.show({"experiment": str(path)}, lambda: terminal.say(f"experiment: {path}"))
 
 
-@_command("demo", "lfpiv demo", "lfpiv demo --out somewhere --device cpu")
+@command("demo", "lfpiv demo", "lfpiv demo --out somewhere --device cpu")
 def _demo(out: Out = Path("lfpiv-demo"), device: Device = None) -> None:
     """Simulate a small two-camera experiment and run everything on it."""
     with _output.progress() as progress:
@@ -375,7 +302,7 @@ def _demo(out: Out = Path("lfpiv-demo"), device: Device = None) -> None:
     _output.show(summary, lambda: terminal.print_demo(summary, out))
 
 
-@_command("reproduce", "lfpiv reproduce --out paper", "lfpiv reproduce fig10 fig14 --out paper --seed 1")
+@command("reproduce", "lfpiv reproduce --out paper", "lfpiv reproduce fig10 fig14 --out paper --seed 1")
 def _reproduce(
     out: Out,
     cases: Annotated[
@@ -397,10 +324,10 @@ def _reproduce(
 
 app.add_typer(benchmark.GROUP, name="benchmark")
 for _name, (_function, _examples) in benchmark.COMMANDS.items():
-    _command(_name, *_examples, group=benchmark.GROUP)(_function)
+    command(_name, *_examples, group=benchmark.GROUP)(_function)
 
 
-@_command("doctor", "lfpiv doctor", "lfpiv doctor --device cuda")
+@command("doctor", "lfpiv doctor", "lfpiv doctor --device cuda")
 def _doctor(device: Literal["auto", "cpu", "cuda"] = "auto") -> None:
     """Show devices, versions and memory, and test the kernels."""
     with _output.progress():

@@ -26,6 +26,7 @@ from pydantic import NonNegativeInt, PositiveInt, StringConstraints
 
 from lfpiv import hdf5
 from lfpiv.errors import DamagedFile
+from lfpiv.hdf5_structure import check_structure
 from lfpiv.records import RecordError, open_regular, read_object, read_text, validate
 
 WHOLE_BYTES = 4 << 30
@@ -93,7 +94,7 @@ def verify_netcdf(path: Path) -> None:
         hdf5.verify(path)
     else:
         with hdf5.glanced(path) as file:
-            hdf5.check_structure(file, os.path.getsize(path))
+            check_structure(file, os.path.getsize(path))
 
 
 def zarr_attributes(path: Path) -> dict[str, Any]:
