@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.pair_figures import pair_figures
 from support.stored import rewrite, small_background, small_calibration
 from support.vector_sets import random_vectors
 
@@ -106,18 +107,10 @@ def mutations(draw, record):
 
 
 WARNING = Warning(code=Code.SATURATED, subject="left, frame a", figures={"share": 0.2}, pairs=(1, 2))
-FIGURES = PairFigures(
-    vectors=[2, 3, 4],
-    valid_fraction=0.9,
-    finite_fraction=1.0,
-    seen_fraction=1.0,
-    measurable_fraction=1.0,
-    verdict="most vectors are valid",
+FIGURES = pair_figures(
+    0.9,
     warnings=(WARNING,),
-    reconstruction_s=1.0,
-    correlation_s=1.0,
     velocity_m_per_s={"u": Spread(mean=0.1, sd=0.2, min=None, max=1.0)},
-    uncertainty_voxel=None,
     peak_ratio=2.0,
     residual={"a": [0.9, 0.5]},
     structure={"a": {"left": 0.5}},

@@ -4,8 +4,10 @@ import json
 import logging
 from dataclasses import replace
 
+from support.pair_figures import pair_figures
+
 from lfpiv.runs import result_warnings
-from lfpiv.runs.pair_figures import PairFigures, Spread
+from lfpiv.runs.pair_figures import PairFigures
 from lfpiv.velocity.cross_correlation import Verdict
 from lfpiv.warn import SENTENCES, Code, FirstOfEachCode, Warning, collected, gather, warn
 
@@ -70,20 +72,7 @@ def test_volumes_that_explain_little_are_named():
 
 
 def figures(verdict, valid_fraction):
-    return PairFigures(
-        vectors=[1, 2, 3],
-        valid_fraction=valid_fraction,
-        finite_fraction=1.0,
-        seen_fraction=1.0,
-        measurable_fraction=1.0,
-        verdict=verdict,
-        warnings=(dark(0.1),),
-        reconstruction_s=1.0,
-        correlation_s=1.0,
-        velocity_m_per_s={"u": Spread(mean=None, sd=None, min=None, max=None)},
-        uncertainty_voxel=None,
-        peak_ratio=2.0,
-    )
+    return pair_figures(valid_fraction, verdict=verdict, warnings=(dark(0.1),))
 
 
 def test_gathered_warnings_come_back_with_their_pairs_and_ranges():

@@ -5,11 +5,11 @@ import tracemalloc
 from operator import length_hint
 
 import pytest
+from support.pair_figures import pair_figures
 from support.small_run import PAIRS, write_empty_report
 
 from lfpiv.runs import pipeline, summary, usable_images, work_units
 from lfpiv.runs.finished_pairs import FinishedPairs
-from lfpiv.runs.pair_figures import PairFigures, Spread
 from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.run import open_run
 from lfpiv.warn import Code, Gathering, Warning
@@ -71,22 +71,7 @@ def test_work_units_are_cut_as_they_are_needed():
 
 
 def figures(valid):
-    """Return figures of a pair with a share of valid vectors."""
-    none = Spread(mean=None, sd=None, min=None, max=None)
-    return PairFigures(
-        vectors=[1, 2, 3],
-        valid_fraction=valid,
-        finite_fraction=1.0,
-        seen_fraction=1.0,
-        measurable_fraction=1.0,
-        verdict="good",
-        warnings=(Warning(code=Code.DIM, subject="left", figures={"structure": valid}),),
-        reconstruction_s=1.0,
-        correlation_s=0.5,
-        velocity_m_per_s=dict.fromkeys("uvw", none),
-        uncertainty_voxel=None,
-        peak_ratio=None,
-    )
+    return pair_figures(valid, warnings=(Warning(code=Code.DIM, subject="left", figures={"structure": valid}),))
 
 
 def test_figures_of_finished_pairs_are_a_mapping_on_disk(tmp_path):

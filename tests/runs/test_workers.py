@@ -33,9 +33,6 @@ from lfpiv_kernels.runtime import Device
 
 ROOT = Path(__file__).resolve().parents[2]
 
-TOLERANCE_ADJOINT = 1e-6
-"""Both sides of <W v, i> = <v, W^T i> are float32 sums over some 1e6 products of positive numbers, in parts."""
-
 
 CPU, GPU = Device("cpu", 8), Device("cuda", 8)
 
@@ -150,8 +147,6 @@ def test_stored_weights_are_the_same_operator(weights, tmp_path):
         assert isinstance(blocks.value.base, np.memmap) and not blocks.value.flags.writeable  # shared, not copied
     back = opened.T(images)
     assert np.array_equal(weights.T(images), back) and np.array_equal(weights.column_sum, opened.column_sum)
-    left = sum(float(np.vdot(seen[name].astype(float), images[name])) for name in images)
-    assert left == pytest.approx(float(np.vdot(volume.astype(float), back)), rel=TOLERANCE_ADJOINT)
     assert (opened.largest, opened.forms, opened.method) == (weights.largest, weights.forms, weights.method)
     assert storage.save_weights(opened, tmp_path / "again") == content
 

@@ -174,6 +174,16 @@ def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
     assert np.mean(interpolation_errors(wide, sample, own)) > 2 * error
 
 
+def assert_adjoint(nodes, every, rng):
+    """Assert <W v, p> = <v, W.T p>, and sums of the columns as of all voxels."""
+    images = {name: rng.standard_normal(camera.gain.shape).astype(np.float32) for name, camera in nodes.cameras.items()}
+    volume = rng.standard_normal(GRID.shape).astype(np.float32)
+    projected, back = nodes(volume), nodes.T(images)
+    left = sum(np.vdot(projected[name].astype(float), images[name]) for name in images)
+    assert left == pytest.approx(np.vdot(volume.astype(float), back), rel=TOLERANCE_ADJOINT, abs=1e-3)
+    np.testing.assert_allclose(nodes.column_sum, every.column_sum, rtol=0.01)
+
+
 def test_operator_with_nodes_is_that_of_all_voxels(both):
     nodes, every = both
     assert all(isinstance(nodes.projector(name), NodeProjector) for name in nodes.cameras)
@@ -186,12 +196,7 @@ def test_operator_with_nodes_is_that_of_all_voxels(both):
         found, expected = nodes(volume), every(volume)
         for name in nodes.cameras:
             assert np.linalg.norm(found[name] - expected[name]) < largest * np.linalg.norm(expected[name])
-    images = {name: rng.standard_normal(camera.gain.shape).astype(np.float32) for name, camera in nodes.cameras.items()}
-    volume = rng.standard_normal(GRID.shape).astype(np.float32)
-    projected, back = nodes(volume), nodes.T(images)
-    left = sum(np.vdot(projected[name].astype(float), images[name]) for name in images)
-    assert left == pytest.approx(np.vdot(volume.astype(float), back), rel=TOLERANCE_ADJOINT, abs=1e-3)
-    np.testing.assert_allclose(nodes.column_sum, every.column_sum, rtol=0.01)
+    assert_adjoint(nodes, every, rng)
     assert nodes.largest == pytest.approx(every.largest, rel=0.05)
     apart = np.abs(nodes.affected_pixels / every.affected_pixels - 1)  # a weighted mean of whole numbers
     assert apart.mean() < 0.04 and apart.max() < 0.4
@@ -207,12 +212,7 @@ def test_operator_with_lines_of_sight_is_that_of_all_voxels(between):
     found, expected = (weights(ndimage.gaussian_filter(sparse, 0.9)) for weights in between)
     for name in nodes.cameras:
         assert np.linalg.norm(found[name] - expected[name]) < PARTICLE_ERROR * np.linalg.norm(expected[name])
-    images = {name: rng.standard_normal(camera.gain.shape).astype(np.float32) for name, camera in nodes.cameras.items()}
-    volume = rng.standard_normal(GRID.shape).astype(np.float32)
-    projected, back = nodes(volume), nodes.T(images)
-    left = sum(np.vdot(projected[name].astype(float), images[name]) for name in images)
-    assert left == pytest.approx(np.vdot(volume.astype(float), back), rel=TOLERANCE_ADJOINT, abs=1e-3)
-    np.testing.assert_allclose(nodes.column_sum, every.column_sum, rtol=0.01)
+    assert_adjoint(nodes, every, rng)
     unit = np.zeros(GRID.shape, np.float32)
     unit[13, 5, 9] = 1.0
     for name, image in nodes(unit).items():
