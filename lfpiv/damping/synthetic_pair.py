@@ -19,7 +19,7 @@ import numpy as np
 
 from lfpiv.damping.particle_images import ParticleImager
 from lfpiv.geometry.grid import Grid
-from lfpiv.reconstruction.particle_size import LIT_SHARE, SubApertures
+from lfpiv.reconstruction.particle_size import LIT_SHARE, SubApertures, is_above_noise
 from lfpiv.weights.operator import Images, Weights
 
 Displacement = Callable[[np.ndarray], np.ndarray]
@@ -80,17 +80,19 @@ class RecordedImages:
         ValueError
             If the images show no particles.
         """
-        known, sigmas, shares = self._references, [], []
         recorded = {name: np.mean([self._ratios(name, one[name]) for one in images], axis=0) for name in self._seen}
-        for name, (same, beside) in recorded.items():
-            if same > 0 and beside > 0:
-                width = np.maximum.accumulate(known[name][:, 1] / known[name][:, 0])
-                sigmas.append(np.interp(beside / same, width, SIGMAS_VOXEL))
-        if not sigmas:
+        shown = {name: ratios.sum(1) for name, ratios in recorded.items() if is_above_noise(ratios[0])}
+        if not shown:
             raise ValueError("images: expected particles, found only noise.")
+        known, sigmas = self._references, []
+        for name, (same, beside) in shown.items():
+            width = np.maximum.accumulate(known[name][:, 1] / known[name][:, 0])
+            sigmas.append(np.interp(beside / same, width, SIGMAS_VOXEL))
         sigma = float(np.sqrt(np.mean(np.square(sigmas))))
-        for name, ratios in recorded.items():
-            shares.append(ratios.sum() / np.exp(np.interp(sigma, SIGMAS_VOXEL, np.log(known[name].sum(1)))))
+        shares = [
+            ratios.sum() / np.exp(np.interp(sigma, SIGMAS_VOXEL, np.log(known[name].sum(1))))
+            for name, ratios in shown.items()
+        ]
         return RecordedParticles(
             density=1 / (float(np.mean(shares)) * self.weights.grid.size),
             sigma_voxel=sigma,
@@ -111,15 +113,15 @@ class RecordedImages:
             for number in range(REFERENCES):
                 places = random_places(grid, count, np.random.default_rng([DRAWS, number]))
                 for name, image in imager(places, self.light(places)).items():
-                    found[name][size] += count * self._ratios(name, image) / REFERENCES
+                    found[name][size] += count * self._ratios(name, image).sum(1) / REFERENCES
         return found
 
     def _ratios(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Return the covariances at the same lens and one lens away over the square of the light, shape (2,).
+        """Return the covariances at the same lens and one away over the square of the light, shape (2, sub-aperture).
 
         They are not numbers where there is no light.
         """
-        covariances: np.ndarray = self._sub_apertures[name].fluctuations(image).covariances.sum(1)
+        covariances = self._sub_apertures[name].fluctuations(image).covariances
         ratios: np.ndarray = covariances / (self._light(name, image) ** 2 or np.nan)
         return ratios
 

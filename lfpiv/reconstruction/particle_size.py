@@ -291,7 +291,7 @@ class ParticleSizer:
         for name, known in self._ratios.items():
             here, next_lens = fluctuations[name].covariances
             count = len(here)
-            if known[-1] - known[0] < LEAST_RANGE or not here.mean() > SIGNIFICANCE * here.std() / count**0.5:
+            if known[-1] - known[0] < LEAST_RANGE or not is_above_noise(here):
                 continue
             without_one = (next_lens.sum() - next_lens) / (here.sum() - here)
             ratio = next_lens.sum() / here.sum() - np.sqrt((count - 1) * without_one.var())  # jackknife
@@ -332,9 +332,14 @@ class ParticleSizer:
             cumulants = fluctuations[name].cumulants
             products = cumulants[1]
             equal = float(np.interp(variance, np.square(WIDTHS_VOXEL), known))
-            if equal > 0 and products.mean() > SIGNIFICANCE * products.std() / len(products) ** 0.5:
+            if equal > 0 and is_above_noise(products):
                 scatters.append(_skewness(cumulants) / equal)
         return float(np.mean(scatters)) if scatters else None
+
+
+def is_above_noise(products: np.ndarray) -> bool:
+    """Return whether the products at the same lens, of each sub-aperture, show particles beyond noise."""
+    return bool(products.mean() > SIGNIFICANCE * products.std() / len(products) ** 0.5)
 
 
 def _skewness(cumulants: np.ndarray) -> float:

@@ -1,7 +1,8 @@
 """Methods of the benchmark's table: this software, and baselines on the same images with the same calibration.
 
-Every method but OpenPIV correlates its volumes as this software does, so their rows differ by the reconstruction alone.
-OpenPIV correlates slices of this software's volumes. It is GPL and optional: it is imported where it is used.
+This software fits both frames together, or links the particles of a single camera. Every other method but OpenPIV correlates its volumes as this
+software does where frames stand alone, so their rows differ by the reconstruction. OpenPIV correlates slices of this
+software's volumes. It is GPL and optional: it is imported where it is used.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from refocused import refocused_volume
 from lfpiv import metrics
 from lfpiv.benchmark.truth import Truth
 from lfpiv.geometry.grid import AXES, Grid
+from lfpiv.joint.vectors import joint_vectors
 from lfpiv.reconstruction.settings import PLAIN
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.results.datasets import write_dataset
@@ -106,13 +108,20 @@ def by_truth(case: Prepared, pair: int) -> Volumes:
     return one(0), one(1)
 
 
-def correlated(case: Prepared, volumes: Volumes) -> xr.Dataset:
-    """Correlate volumes as this software does by default."""
+def by_default(case: Prepared, pair: int, volumes: Volumes) -> xr.Dataset:
+    """Return the vectors of this software: from links with a single camera, else from the joint fit."""
+    if case.rig.experiment.by_links:
+        return case.rig.vectors(pair)
+    return joint_vectors(volumes, dt_s=case.rig.experiment.dt_s, **case.rig.correlation)
+
+
+def correlated(case: Prepared, pair: int, volumes: Volumes) -> xr.Dataset:
+    """Correlate volumes as this software does where frames stand alone."""
     first, second = volumes
     return correlate(first, second, dt_s=case.rig.experiment.dt_s, **case.rig.correlation)
 
 
-def by_openpiv(case: Prepared, volumes: Volumes) -> xr.Dataset:
+def by_openpiv(case: Prepared, pair: int, volumes: Volumes) -> xr.Dataset:
     """Correlate slices of volumes by OpenPIV: u and v in slices along z, w in slices along y.
 
     A slice is the sum over as many layers as a window is wide. Windows are deformed in the last two passes.
@@ -160,8 +169,8 @@ def _planar(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return across, down, good
 
 
-METHODS: Mapping[str, tuple[str, Reconstruct, Callable[[Prepared, Volumes], xr.Dataset]]] = {
-    "lfpiv": ("lfpiv, defaults", by_lfpiv, correlated),
+METHODS: Mapping[str, tuple[str, Reconstruct, Callable[[Prepared, int, Volumes], xr.Dataset]]] = {
+    "lfpiv": ("lfpiv, defaults", by_lfpiv, by_default),
     "paper": ("ten plain iterations (the paper's)", by_paper, correlated),
     "mlos": ("first guess (MLOS)", by_first_guess, correlated),
     "refocused": ("refocused stacks", by_refocusing, correlated),
@@ -180,7 +189,7 @@ def measure(case: Prepared, method: str, pair: int, folder: Path, volumes: Volum
     start = time.process_time()
     _, reconstructed, correlation = METHODS[method]
     found = reconstructed(case, pair) if volumes is None else volumes
-    vectors = correlation(case, found)
+    vectors = correlation(case, pair, found)
     seconds = time.process_time() - start
     names = [name for name in ("u", "v", "w", "valid") if name in vectors]
     names += [f"uncertainty_{axis}" for axis in "xyz" if f"uncertainty_{axis}" in vectors]

@@ -67,13 +67,22 @@ def test_number_and_size_of_particles_are_found_under_noise(weights, count, sigm
     assert found.noise == NOISE
 
 
+def test_points_whose_covariance_one_lens_away_is_negative_by_chance_are_particles(weights, monkeypatch):
+    places = random_places(GRID, 200, np.random.default_rng(1))
+    images = ParticleImager(weights, 0.0)(places, np.full(len(places), 4e4))
+    recorded = RecordedImages(weights, even)
+    assert recorded._references and (ratios := recorded._ratios)
+    monkeypatch.setattr(recorded, "_ratios", lambda *image: ratios(*image) * [[1.0], [-0.1]])
+    assert recorded.particles([images], NOISE).sigma_voxel == 0
+
+
 @pytest.mark.slow
-def test_images_without_particles_say_so(weights):
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_images_without_particles_say_so(weights, sigma):
     rng = np.random.default_rng(0)
-    noise = {name: rng.standard_normal(camera.optics.sensor_shape) for name, camera in weights.cameras.items()}
-    dark = {name: np.zeros_like(image) for name, image in noise.items()}
+    noise = {name: sigma * rng.standard_normal(one.optics.sensor_shape) for name, one in weights.cameras.items()}
     with pytest.raises(ValueError, match="particles"):
-        RecordedImages(weights, even).particles([dark], NOISE)
+        RecordedImages(weights, even).particles([noise], NOISE)
 
 
 def test_simulated_images_have_light_and_noise_of_the_recorded_ones(weights):
