@@ -80,11 +80,11 @@ class RecordedImages:
         ValueError
             If the images show no particles.
         """
-        recorded = {name: np.mean([self._ratios(name, one[name]) for one in images], axis=0) for name in self._seen}
+        recorded = {name: np.mean([self.ratios(name, one[name]) for one in images], axis=0) for name in self._seen}
         shown = {name: ratios.sum(1) for name, ratios in recorded.items() if is_above_noise(ratios[0])}
         if not shown:
             raise ValueError("images: expected particles, found only noise.")
-        known, sigmas = self._references, []
+        known, sigmas = self.references, []
         for name, (same, beside) in shown.items():
             width = np.maximum.accumulate(known[name][:, 1] / known[name][:, 0])
             sigmas.append(np.interp(beside / same, width, SIGMAS_VOXEL))
@@ -102,8 +102,8 @@ class RecordedImages:
         )
 
     @cached_property
-    def _references(self) -> dict[str, np.ndarray]:
-        """Camera name -> `_ratios` of one particle in the grid, for each of `SIGMAS_VOXEL`, shape (size, 2)."""
+    def references(self) -> dict[str, np.ndarray]:
+        """Camera name -> `ratios` of one particle in the grid, for each of `SIGMAS_VOXEL`, shape (size, 2)."""
         grid, found = self.weights.grid, {name: np.zeros((len(SIGMAS_VOXEL), 2)) for name in self._seen}
         pitches = {name: camera.optics.microimage_pitch_px for name, camera in self.weights.cameras.items()}
         lenses = min(seen.sum() / pitches[name] ** 2 for name, seen in self._seen.items())
@@ -113,10 +113,10 @@ class RecordedImages:
             for number in range(REFERENCES):
                 places = random_places(grid, count, np.random.default_rng([DRAWS, number]))
                 for name, image in imager(places, self.light(places)).items():
-                    found[name][size] += count * self._ratios(name, image).sum(1) / REFERENCES
+                    found[name][size] += count * self.ratios(name, image).sum(1) / REFERENCES
         return found
 
-    def _ratios(self, name: str, image: np.ndarray) -> np.ndarray:
+    def ratios(self, name: str, image: np.ndarray) -> np.ndarray:
         """Return the covariances at the same lens and one away over the square of the light, shape (2, sub-aperture).
 
         They are not numbers where there is no light.

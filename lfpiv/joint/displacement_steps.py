@@ -39,6 +39,8 @@ SECOND_DIFFERENCES = 18.0
 """Largest diagonal element of the prior: 6 of the squared second differences along each of three axes."""
 BRIGHT = 0.9
 """Share of the light whose voxels make the curvature."""
+LEAST_SUM = 0.02
+"""Least sum of the weights of a voxel that a camera sees, as a share of its largest one."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,9 @@ class Residual:
     """||I - P|| / ||I||."""
     misfit: float
     """SMART's misfit [counts]."""
+    unlike: float
+    """How much the cameras ask for unlike light: of the mean log(I / P) of a voxel's rays, the standard deviation
+    between the cameras less the mean of all cameras, in squares, weighted by the volume."""
 
 
 @dataclass(frozen=True)
@@ -146,14 +151,24 @@ class DisplacementSteps:
     def _residual(self, frame: int, light: np.ndarray, transport: Transport) -> Residual:
         model, prepared = self.model, self.model.frames[frame]
         volume, equations = model.volume(frame, light, transport), prepared.equations
+        stored = model.weights.stored.store(volume)
         with equations.locked():
             equations.begin()
+            on_device = to_device(stored, float)
             rays = whole_subset(len(prepared.images)).parts
-            exponent = to_host(equations.exponent_of(rays, to_device(model.weights.stored.store(volume), float))).copy()
+            exponents = [to_host(equations.exponent_of((one,), on_device)).copy() for one in rays]
             misfit = equations.measured()
         norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
-        back = model.sieved(model.weights.stored.restore(exponent))
-        return Residual(volume, back, float(np.sqrt(misfit.squares / norm)), misfit.divergence)
+        gains = [one.camera_gain for one in prepared.images.values()]
+        return Residual(
+            volume=volume,
+            exponent=model.sieved(model.weights.stored.restore(np.sum(exponents, axis=0))),
+            relative=float(np.sqrt(misfit.squares / norm)),
+            misfit=misfit.divergence,
+            unlike=unlike_light(
+                exponents, [gain * own for gain, own in zip(gains, model.weights.camera_sums, strict=True)], stored
+            ),
+        )
 
     def gradient(
         self, light: np.ndarray, transports: tuple[Transport, Transport], residuals: Sequence[Residual]
@@ -228,6 +243,16 @@ class DisplacementSteps:
             mean = (draw * curvature(draw)).sum((1, 2, 3)) / (draw**2).sum((1, 2, 3))
             self._scale = np.maximum(mean, LEAST_CURVATURE * mean.max())[:, None, None, None]
         return self._scale
+
+
+def unlike_light(exponents: Sequence[np.ndarray], sums: Sequence[np.ndarray], volume: np.ndarray) -> float:
+    """Return how much cameras ask for unlike light, see `Residual`, from the exponents and the sums of the weights."""
+    seen = np.all([own > LEAST_SUM * own.max() for own in sums], axis=0) & (volume > 0)
+    if not seen.any():
+        return 0.0
+    asked = np.stack([one[seen] / own[seen] for one, own in zip(exponents, sums, strict=True)])
+    beyond = np.average(asked.var(axis=0, ddof=1) - asked.mean(axis=0) ** 2, weights=volume[seen])
+    return float(np.sqrt(max(beyond, 0.0)))
 
 
 def brightest(light: np.ndarray, share: float) -> np.ndarray:

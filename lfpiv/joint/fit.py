@@ -73,6 +73,8 @@ class JointFit:
     """Misfit over that of the frames by themselves."""
     lossy: bool
     """Whether brightness may differ between the frames."""
+    unlike: float
+    """How much the cameras ask for unlike light, root mean square over the frames."""
     residuals: Sequence[Residual]
     """Of both frames of the result."""
 
@@ -120,7 +122,8 @@ def fit_pair(
             break
     residuals = movement.residuals(light.values, model.transports(nodes))
     ratio = sum(one.misfit for one in residuals) / alone
-    return JointFit(light.values, nodes, done, ratio, model.rho is not None, residuals)
+    unlike = float(np.sqrt(np.mean([one.unlike**2 for one in residuals])))
+    return JointFit(light.values, nodes, done, ratio, model.rho is not None, unlike, residuals)
 
 
 def _loss(model: JointModel, found: Sequence[Reconstruction], nodes: np.ndarray) -> np.ndarray | None:

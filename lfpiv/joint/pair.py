@@ -76,6 +76,7 @@ class PairResult:
                 volume = volume.assign_coords({UNSHARED: (volume.dims, before.volume, about)})
                 ratio = round(self.fit.misfit_ratio, 4)
                 volume.attrs |= {"rounds": self.fit.rounds, "misfit_ratio": ratio, "lossy": int(self.fit.lossy)}
+                volume.attrs["unlike"] = round(self.fit.unlike, 4)
             volumes.append(volume if grid is None else volume_on(volume, grid))
         first, second = volumes
         if self.fit is not None and self.model is not None:
@@ -243,7 +244,8 @@ def reconstruct_pair(
     list of two DataArrays, shape (z, y, x), float32
         Volumes as `reconstruct` returns them, with the attribute `estimate`: how they were made. After a joint fit the
         attributes `rounds`, `misfit_ratio` and `lossy` state its rounds, its misfit over that of the frames by
-        themselves, and whether brightness differs between the frames, since particles are lost between them. The last
+        themselves, and whether brightness differs between the frames, since particles are lost between them. `unlike`
+        states how much the cameras ask for unlike light (`lfpiv.joint.displacement_steps.Residual`). The last
         of `residual` and `misfit` are those of the fit, the coordinate `UNSHARED` is the volume of the frame by itself,
         and the coordinates `MOVED` of the first volume are the displacement. `joint_vectors` makes vectors of them.
 

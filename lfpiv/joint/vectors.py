@@ -12,7 +12,8 @@ standard deviation stated holds 84 to 100 % of the errors of a component, and 79
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,14 +38,19 @@ from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 CONTRADICTION = 8.0
 """Displacement that is left between the frames by themselves, over the median of its standard deviation, above which
 they contradict. Ghosts leave some, up to 6 in sound pairs."""
-ALONE_SHARE, LEFT_SHARE, LOSSY = 0.45, 0.3, 2.0
+ALONE_SHARE, LEFT_SHARE, LOSSY = 0.39, 0.36, 1.64
 """Standard deviation of a fitted vector: parts that the uncertainty of the frames by themselves and the displacement
 that is left between them add in squares, and the factor of both where particles are lost between the frames."""
+UNLIKE_SHARE = 2.7
+"""Part of the uncertainty of the frames by themselves that is added in squares, times how much the cameras ask for
+unlike light."""
 FARTHEST_VOXEL = 0.5
 """Displacement that is left above which they contradict in any case [voxel]."""
+FIELD_CORRELATION_VOXEL = 5.9
+"""Length over which errors of the fitted displacement at single places correlate [voxel]."""
 
 
-ATTRIBUTES = ("estimate", "rounds", "misfit_ratio", "lossy")
+ATTRIBUTES = ("estimate", "rounds", "misfit_ratio", "lossy", "unlike")
 """Attributes of volumes that their vectors have, too."""
 
 
@@ -75,7 +81,8 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
         ``uncertainty_z``, ``_y``, ``_x`` of fitted vectors combine the uncertainty of the frames by themselves, lowered
         as the fit lowers the error, with the displacement that is left between these frames. ``valid`` is taken from
         the correlation of these frames, ``correlation`` and ``peak_ratio`` from the same frames deformed by the fitted
-        displacement.
+        displacement. Errors of fitted vectors that lie r_z, r_y, r_x voxels apart correlate as the product of
+        ``exp(-(r / L)^2)`` over the axes. The attribute ``error_correlation_voxel`` has L along z, y and x.
 
     Raises
     ------
@@ -92,8 +99,7 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
         return vectors
     alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
     vectors = correlate(*alone, dt_s=dt_s, **correlation)
-    lossy = LOSSY if about.get("lossy") else 1.0
-    return _merged(vectors, compare(vectors, volumes, alone), lossy).assign_attrs(about)
+    return _merged(vectors, compare(vectors, volumes, alone), about).assign_attrs(about)
 
 
 @dataclass(frozen=True)
@@ -165,14 +171,15 @@ def _predictor(moved: np.ndarray) -> Predictor:
     return Predictor.between(places, moved[np.ix_(*places)].astype(float), triple(moved.shape[:3]))
 
 
-def _merged(vectors: xr.Dataset, evidence: Evidence, factor: float = 1.0) -> xr.Dataset:
-    """Return the vectors with the fitted displacement where the frames agree with it."""
+def _merged(vectors: xr.Dataset, evidence: Evidence, about: Mapping[str, Any]) -> xr.Dataset:
+    """Return the vectors with the fitted displacement where the frames agree with it; `about` has `ATTRIBUTES`."""
     valid = vectors["valid"].values
     own = np.stack([vectors[f"displacement_{axis}"].values for axis in AXES], -1)
     joint = evidence.agrees(valid) & np.isfinite(own).all(-1)
     displacement = np.where(joint[..., None], evidence.fitted, own)
     stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
-    fitted = factor * np.sqrt((ALONE_SHARE * stated) ** 2 + (LEFT_SHARE * evidence.left) ** 2)
+    shared = ALONE_SHARE**2 + (UNLIKE_SHARE * about.get("unlike", 0.0)) ** 2
+    fitted = np.sqrt(shared * stated**2 + (LEFT_SHARE * evidence.left) ** 2) * (LOSSY if about.get("lossy") else 1.0)
     merged = with_displacement(vectors, displacement, np.where(joint[..., None], fitted, stated))
     found = {
         name: vectors[name].copy(data=np.where(joint, deformed, vectors[name].values).astype(np.float32))
@@ -180,7 +187,18 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, factor: float = 1.0) -> xr.
     }
     found["joint"] = _flags(joint, vectors)
     share = float(joint[valid].mean()) if valid.any() else 0.0
-    return merged.assign(found).assign_attrs(joint_fraction=share)
+    return merged.assign(found).assign_attrs(
+        joint_fraction=share,
+        error_correlation_voxel=error_correlation_voxel(CorrelationSettings.of(vectors).windows[-1]),
+    )
+
+
+def error_correlation_voxel(window: Sequence[int]) -> list[float]:
+    """Return the length L over which errors of means over windows correlate, along each axis [voxel].
+
+    The mean over a window of edge w adds w^2 / 3 to the square of the length at single places.
+    """
+    return [round(math.sqrt(FIELD_CORRELATION_VOXEL**2 + edge**2 / 3), 1) for edge in window]
 
 
 def _flags(joint: np.ndarray, vectors: xr.Dataset) -> xr.DataArray:

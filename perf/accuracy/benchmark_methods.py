@@ -1,8 +1,8 @@
 """Methods of the benchmark's table: this software, and baselines on the same images with the same calibration.
 
-This software fits both frames together, or links the particles of a single camera. Every other method but OpenPIV correlates its volumes as this
-software does where frames stand alone, so their rows differ by the reconstruction. OpenPIV correlates slices of this
-software's volumes. It is GPL and optional: it is imported where it is used.
+This software fits both frames together, or links the particles of a single camera. Every other method but OpenPIV
+correlates its volumes as this software does where frames stand alone, so their rows differ by the reconstruction.
+OpenPIV correlates slices of this software's volumes. It is GPL and optional: it is imported where it is used.
 """
 
 from __future__ import annotations

@@ -71,8 +71,9 @@ def test_points_whose_covariance_one_lens_away_is_negative_by_chance_are_particl
     places = random_places(GRID, 200, np.random.default_rng(1))
     images = ParticleImager(weights, 0.0)(places, np.full(len(places), 4e4))
     recorded = RecordedImages(weights, even)
-    assert recorded._references and (ratios := recorded._ratios)
-    monkeypatch.setattr(recorded, "_ratios", lambda *image: ratios(*image) * [[1.0], [-0.1]])
+    ratios = recorded.ratios
+    assert recorded.references.keys() == images.keys()  # made before the covariance of the images is changed
+    monkeypatch.setattr(recorded, "ratios", lambda *image: ratios(*image) * [[1.0], [-0.1]])
     assert recorded.particles([images], NOISE).sigma_voxel == 0
 
 

@@ -1,5 +1,7 @@
 """Joint fit of both frames: a third of the error, a wrong start forgotten, and correlation where frames disagree."""
 
+import math
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -28,22 +30,27 @@ def weights(device):
     return lfpiv.build_weights(two_cameras(optics=optics(440, 640)), GRID)
 
 
-def images_of(weights, positions, seed):
-    """Return images of blobs as the weights have them, with shot and read noise."""
-    rng, images = np.random.default_rng(seed), {}
-    light = metrics.truth_volume(positions, None, GRID, BLOB).values * np.float32(3e5)
-    for name, image in weights(light).items():
+def images_of(weights, positions, seed, unlike=0.0):
+    """Return images of blobs, unlike bright in each camera, as the weights have them, with shot and read noise."""
+    rng, images, light = np.random.default_rng(seed), {}, np.random.default_rng(4)
+    for name in weights.cameras:
+        bright = np.exp(unlike * light.standard_normal(len(positions)))
+        image = weights(metrics.truth_volume(positions, bright, GRID, BLOB).values * np.float32(3e5))[name]
         images[name] = (image + rng.standard_normal(image.shape) * np.sqrt(0.4 * image + 4)).astype(np.float32)
     return images
 
 
-@pytest.fixture(scope="module")
-def pair(weights):
-    """Flow, and images of both frames of a densely seeded pair."""
+def recorded(weights, unlike=0.0):
+    """Return a flow, and images of both frames of a densely seeded pair."""
     flow, rng = Swirl(peak_mm=0.15, core_mm=0.8, axial_mm=0.08), np.random.default_rng(3)
     middle = np.array([0.1, -0.1, 0.2]) + rng.uniform(-0.5, 0.5, (240, 3)) * np.array([2.4, 2.2, 2.0])
     moved = flow(middle)
-    return flow, [images_of(weights, middle + side * moved / 2, [3, k]) for k, side in enumerate((-1, 1))]
+    return flow, [images_of(weights, middle + side * moved / 2, [3, k], unlike) for k, side in enumerate((-1, 1))]
+
+
+@pytest.fixture(scope="module")
+def pair(weights):
+    return recorded(weights)
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +80,19 @@ def test_both_frames_fitted_together_measure_better(pair, fitted):
     velocity = vectors["displacement_x"].values * GRID.voxel_mm * 1e-3 / 1e-3
     np.testing.assert_allclose(vectors["u"].values, velocity, rtol=1e-4, atol=1e-6)
     assert seen == sorted(seen) and seen[-1] == 1.0
+    assert vectors.attrs["error_correlation_voxel"] == pytest.approx([math.sqrt(5.9**2 + 12**2 / 3)] * 3, abs=0.05)
+
+
+def test_vectors_of_particles_that_are_unlike_bright_in_the_cameras_are_less_certain(weights, pair, fitted):
+    """Such errors are the same in both frames, so only the cameras tell."""
+    other = lfpiv.reconstruct_pair(weights, recorded(weights, unlike=1.0)[1], estimate="joint", sieve_voxel=0.7)
+    unlike, alike = other[0].attrs["unlike"], fitted[0][0].attrs["unlike"]
+    assert unlike > 3 * alike > 0
+    vectors = joint_vectors(other, **CORRELATION)
+    assert vectors.attrs["unlike"] == unlike
+    less = joint_vectors([one.assign_attrs(unlike=0.0) for one in other], **CORRELATION)
+    told = (vectors["joint"] & vectors["valid"]).values
+    assert told.any() and (vectors["uncertainty"].values > less["uncertainty"].values)[told].all()
 
 
 def test_the_field_is_finer_than_its_vectors(pair, fitted):
