@@ -294,7 +294,7 @@ def _with_voxels(run: Run, assumptions: list[str]) -> Run:
     if run.guard is None:
         assumptions.append("the search of all images for background, guard layers and particle size is not in the plan")
     if experiment.tracking is not None:
-        assumptions.append("the time of [tracking] is not in the plan")
+        assumptions.append("the time of tracking is not in the plan")
     if experiment.in_sequence:
         assumptions.append("each instant is reconstructed by itself: the time of smart.predict differs")
     if experiment.self_calibration.pairs:

@@ -63,7 +63,9 @@ def decide(
     are called only if pairs must be simulated.
     """
     if not experiment.simulated_pairs:
-        if experiment.bootstrap.pairs:
+        if experiment.by_links:
+            log.info("damping by ghosts: not measured, since ghosts do not damp vectors of linked particles")
+        elif experiment.bootstrap.pairs:
             why = "since a joint fit hardly damps" if experiment.is_joint else "in so short a run"
             log.info("damping by ghosts: not measured %s; set bootstrap.pairs to measure it", why)
         with writing(folder.bootstrap):

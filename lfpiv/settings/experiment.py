@@ -33,3 +33,7 @@ class ExperimentTable(Table):
     self_calibration: SelfCalibration = SelfCalibration()
     bootstrap: Bootstrap = Bootstrap()
     compute: Compute = Compute()
+
+    def tracking_of(self, cameras: int) -> Tracking | None:
+        """Return the settings of the tracking, which a single camera has without a table; None without tracking."""
+        return Tracking() if self.tracking is None and cameras == 1 else self.tracking

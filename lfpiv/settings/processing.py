@@ -90,7 +90,7 @@ class Correlation(Table):
 
 
 class Tracking(Table):
-    """Table ``[tracking]``: displacements of single particles beside the correlation; absent: none."""
+    """Table ``[tracking]``: displacements of single particles; absent: none, or the defaults with a single camera."""
 
     rounds: Annotated[int, Field(strict=True, ge=1, le=20)] = 5
     """Largest number of rounds in which particles are fitted to the images, removed where a camera does not confirm

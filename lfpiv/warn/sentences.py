@@ -222,8 +222,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.ONE_CAMERA: (
         "one camera hardly resolves depth: do not rely on velocities along its line of sight (w, displacement_z for a "
-        "camera on the z axis), nor on their validation; where seeding is thin, the table [tracking] takes vectors "
-        "from single particles, which resolve it better"
+        "camera on the z axis), nor on their validation; vectors from single particles resolve it better: seed thinly, "
+        'and leave tracking.vectors at "auto"'
     ),
     Code.LIGHT_GUARDED: (
         "particles are lit beyond the face {face} of the volume, up to {reach_mm:.2g} mm ({share:percent} % of the "

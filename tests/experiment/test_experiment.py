@@ -10,7 +10,7 @@ from lfpiv.experiment import axes, images
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.settings.experiment import ExperimentTable
-from lfpiv.settings.processing import Compute, Correlation, Network, Smart
+from lfpiv.settings.processing import Compute, Correlation, Network, Smart, Tracking
 
 
 def edit(file, old, new):
@@ -39,6 +39,17 @@ def test_sample_experiment_is_accepted(sample_data):
     experiment = open_experiment(sample_data / "ring-vortex-2cam" / "experiment.toml")
     assert experiment.grid.shape == (30, 60, 60)
     assert experiment.camera("cam1").optics.sensor_shape == (1280, 1600)
+
+
+def test_particles_of_a_single_camera_are_tracked_without_a_table(tiny_experiment):
+    assert open_experiment(tiny_experiment).tracking is None
+    head, left, right = tiny_experiment.read_text().split("[[camera]]")
+    tiny_experiment.write_text(f"{head}[[camera]]{left}{right[right.index('[board]') :]}")
+    alone = open_experiment(tiny_experiment)
+    assert [camera.name for camera in alone.cameras] == ["left"]
+    assert alone.tracking == Tracking() and alone.by_links
+    edit(tiny_experiment, "[board]", '[tracking]\nvectors = "correlation"\n\n[board]')
+    assert not open_experiment(tiny_experiment).by_links
 
 
 @pytest.mark.parametrize(
