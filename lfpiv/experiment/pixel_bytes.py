@@ -47,8 +47,11 @@ def fault(image: np.ndarray) -> str | None:
 
 
 def _likeness(pixels: np.ndarray) -> float:
-    """Return the correlation of neighbours along the rows."""
-    values = pixels.astype(np.float32)
+    """Return the correlation of neighbours along the rows, in logarithms.
+
+    Single bright pixels, hot ones or points, would outweigh all others: an exchange, which wraps them, would seem right.
+    """
+    values = np.log1p(pixels.astype(np.float32))
     values -= values.mean()
     power = float((values**2).mean(dtype=float))
     return 1 - float((np.diff(values) ** 2).mean(dtype=float)) / (2 * power) if power > 0 else 0.0

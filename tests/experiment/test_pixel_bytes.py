@@ -22,12 +22,17 @@ def test_recorded_images_are_right(light):
     for sound in (light, light * 16, light // 16 * 256, light + rng.normal(0, 60, SHAPE), light / 7):
         assert fault(np.maximum(sound, 0).astype(np.float32)) is None
         assert fault(np.maximum(sound, 0).round().astype(np.float32)) is None
+    for share in (0.001, 0.01, 0.05):
+        points = np.where(rng.random(SHAPE) < share, rng.exponential(1500, SHAPE), 0).round()
+        assert fault(np.minimum(light // 8 + points, 4095).astype(np.float32)) is None
     for noise in (rng.integers(0, 4096, SHAPE), rng.normal(2000, 300, SHAPE).round(), rng.integers(0, 256, SHAPE)):
         assert fault(noise.astype(np.float32)) is None
 
 
 def test_exchanged_bytes_and_a_low_byte_of_noise_are_named(light):
-    for image in (light, light * 16):
+    rng = np.random.default_rng(9)
+    points = np.where(rng.random(SHAPE) < 0.001, 3000, 0).astype(np.uint16)
+    for image in (light, light * 16, np.maximum(light, points)):
         assert "two bytes are exchanged" in fault(image.byteswap().astype(np.float32))
-    noise = np.random.default_rng(9).integers(0, 256, SHAPE)
+    noise = rng.integers(0, 256, SHAPE)
     assert "low byte is noise" in fault((256 * (light > 2000) + noise).astype(np.float32))
