@@ -8,6 +8,8 @@ ALIKE = 0.3
 """Correlation of neighbouring pixels after the exchange, above which they are alike."""
 UNLIKE = 1.5
 """What correlation lacks from 1 as they are, relative to the same after the exchange, above which they are not."""
+LARGEST_SHARE = 0.5
+"""Share of the pixels with light whose high byte is the same, above which it is no low byte: noise would vary it."""
 ONE_HIGH_BYTE = 0.8
 """Share of the pixels with one high byte among which the low byte is judged."""
 EVEN = 0.8
@@ -33,7 +35,7 @@ def fault(image: np.ndarray) -> str | None:
         return None
     pixels = rows.astype(np.uint16)
     alike, exchanged = _likeness(pixels), _likeness(pixels.byteswap())
-    if exchanged > ALIKE and 1 - alike > UNLIKE * (1 - exchanged):
+    if _varies(pixels[pixels > 0] >> 8) and exchanged > ALIKE and 1 - alike > UNLIKE * (1 - exchanged):
         return (
             f"pixels whose two bytes are exchanged (neighbours correlate by {alike:.2f}, by {exchanged:.2f} after an "
             "exchange). Save the image in the other byte order, or state byte_order in raw"
@@ -44,6 +46,11 @@ def fault(image: np.ndarray) -> str | None:
     if chosen.size > max(_LEAST_PIXELS, ONE_HIGH_BYTE * pixels.size) and counts.min() > EVEN * counts.max():
         return "pixels whose low byte is noise: all its values are as frequent. Save the image again as recorded"
     return None
+
+
+def _varies(values: np.ndarray) -> bool:
+    """Return whether no value is that of more than `LARGEST_SHARE` of the pixels."""
+    return values.size > 0 and bool(np.bincount(values).max() <= LARGEST_SHARE * values.size)
 
 
 def _likeness(pixels: np.ndarray) -> float:
