@@ -205,8 +205,8 @@ def verify(path: str | Path) -> None:
         pass
 
 
-def require_opening(path: Path) -> None:
-    """Raise what h5py says of an HDF5 file that it cannot open. h5netcdf prints a traceback beside it.
+def netcdf_engine(path: Path) -> str:
+    """Return xarray's engine for a NetCDF file. h5netcdf prints a traceback on files that h5py cannot open.
 
     Raises
     ------
@@ -215,8 +215,10 @@ def require_opening(path: Path) -> None:
     """
     import h5py
 
-    if h5py.is_hdf5(path):
-        h5py.File(path, "r").close()
+    if not h5py.is_hdf5(path):
+        return "scipy"
+    h5py.File(path, "r").close()
+    return "h5netcdf"
 
 
 # -- the seal ----------------------------------------------------------------------------------------------------------

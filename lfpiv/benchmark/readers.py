@@ -265,8 +265,7 @@ def load_netcdf(path: Path) -> xr.Dataset:
         If it cannot be read, or declares far more values than its bytes hold.
     """
     try:
-        hdf5.require_opening(path)
-        with xr.open_dataset(path, decode_times=False) as dataset:
+        with xr.open_dataset(path, engine=hdf5.netcdf_engine(path), decode_times=False) as dataset:
             values, size = sum(variable.size for variable in dataset.variables.values()), path.stat().st_size
             if values > LARGEST_IMAGE or 8 * values > SMALL_IMAGE + LARGEST_EXPANSION * size:
                 raise ValueError(f"{size:,} bytes declare {values:,} values")

@@ -174,7 +174,7 @@ def read_mask(path: Path, grid: Grid, *, may_miss: bool = False) -> np.ndarray:
 def _load(path: Path) -> xr.DataArray:
     """Return the mask in a file, its coordinates rising."""
     _require(path)
-    with _reading(path), xr.open_dataset(path) as opened:
+    with _reading(path) as engine, xr.open_dataset(path, engine=engine) as opened:
         points = sum(variable.size for variable in opened.variables.values())
         if points > MOST_POINTS:
             raise InputError(f"{path}: expected at most {MOST_POINTS:.0e} points, found {points:.1e}.")
@@ -202,9 +202,9 @@ def _load(path: Path) -> xr.DataArray:
 
 def _layout(path: Path) -> dict[str, tuple[int, ...]]:
     """Return the shape of each variable in a file without reading values, some 40 times as fast as by `_load`."""
-    with _reading(path):
-        if not h5py.is_hdf5(path):
-            with xr.open_dataset(path) as opened:
+    with _reading(path) as engine:
+        if engine == "scipy":
+            with xr.open_dataset(path, engine=engine) as opened:
                 return {str(name): values.shape for name, values in opened.variables.items()}
         with h5py.File(path) as file:
             return {str(name): values.shape for name, values in file.items() if isinstance(values, h5py.Dataset)}
@@ -216,11 +216,10 @@ def _require(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Name a file that cannot be read in the error."""
+def _reading(path: Path) -> Iterator[str]:
+    """Yield xarray's engine for a file; name one that cannot be read in the error."""
     try:
-        hdf5.require_opening(path)
-        yield
+        yield hdf5.netcdf_engine(path)
     except InputError:
         raise
     except Exception as error:  # readers raise exceptions of many types on damaged files

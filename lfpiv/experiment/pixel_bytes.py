@@ -56,7 +56,7 @@ def _varies(values: np.ndarray) -> bool:
 def _likeness(pixels: np.ndarray) -> float:
     """Return the correlation of neighbours along the rows, in logarithms.
 
-    Single bright pixels, hot ones or points, would outweigh all others: an exchange, which wraps them, would seem right.
+    Single bright pixels, hot or points, would outweigh all others: an exchange, which wraps them, would seem right.
     """
     values = np.log1p(pixels.astype(np.float32))
     values -= values.mean()

@@ -178,7 +178,7 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, about: Mapping[str, Any]) -
     joint = evidence.agrees(valid) & np.isfinite(own).all(-1)
     displacement = np.where(joint[..., None], evidence.fitted, own)
     stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
-    shared = ALONE_SHARE**2 + (UNLIKE_SHARE * about.get("unlike", 0.0)) ** 2
+    shared = ALONE_SHARE**2 + (UNLIKE_SHARE * float(about.get("unlike", 0.0))) ** 2  # of a file it is a NumPy scalar
     fitted = np.sqrt(shared * stated**2 + (LEFT_SHARE * evidence.left) ** 2) * (LOSSY if about.get("lossy") else 1.0)
     merged = with_displacement(vectors, displacement, np.where(joint[..., None], fitted, stated))
     found = {

@@ -21,7 +21,8 @@ from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts
 from lfpiv.selfcalibration.belonging import FLIPS, IN_TIME, SURE, ImageFit, Images, Judgement, Kind, Mistake, judge
-from lfpiv.selfcalibration.disparity import SEARCH_VOXEL
+from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes
+from lfpiv.selfcalibration.frame_order import exchanged, own_motion
 from lfpiv.warn import Code, Warning, name_pairs, warn
 
 if TYPE_CHECKING:
@@ -65,12 +66,15 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     order = chain(first[:1], others[1:], first, experiment.numbers)
     tried = list(islice(experiment.disjoint(dict.fromkeys(order)), TRIED))
     shown = ShownParticles(experiment, weights.cameras, tried)
-    judged = _judge(shown if len(tried) > 1 else replace(shown, pairs=()), tried, weights)
+    as_judged = shown if len(tried) > 1 else replace(shown, pairs=())  # one pair does not tell what stands still
+    judged = _judge(as_judged, tried, weights)
     for light in islice(_light(shown, judged), 1):
         _log_scales(light[0])
     refusals = _refusals(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, shown, weights, list(judged))
+    if not refusals and not any(one.in_order for one in judged.values()):
+        refusals = _opposite_motion(experiment, as_judged, weights, tried)
     if refusals:
         return _told(
             "; ".join(dict.fromkeys(str(one.figures["found"]) for one in refusals)),
@@ -224,6 +228,21 @@ def _far_delay(
         if found.mistakes and found.mistakes[0].kind is Kind.LATE:
             return [_refusal(experiment, names, found.mistakes)]
     return []
+
+
+def _opposite_motion(
+    experiment: Experiment, shown: ShownParticles, weights: Weights, pairs: Iterable[int]
+) -> list[Warning]:
+    """Return the refusal of all pairs if particles move in opposite directions in two cameras."""
+    motions = []
+    for light in _light(shown, pairs):
+        volumes = CameraVolumes(weights)
+        for images in light:
+            volumes.add(images)
+        motions.append(own_motion(volumes.own(), weights.volume))
+    cameras = exchanged(motions, weights.cameras, weights.volume) if motions else ()
+    made = [Mistake(Kind.FRAMES, (name,)) for name in cameras]
+    return [_refusal(experiment, list(weights.cameras), made)] if made else []
 
 
 def _shared(judged: Sequence[Judgement]) -> Sequence[Mistake]:

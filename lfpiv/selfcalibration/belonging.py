@@ -20,11 +20,8 @@ from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.weights.operator import Weights
 
-ITERATIONS = 3
+ITERATIONS = 8
 """SMART iterations of a set of images."""
-FREE, SIEVE_VOXEL = 1.4, 0.4
-"""Refinement of the voxels from which a sieve makes the volume as smooth as coarser voxels do, and its standard
-deviation [voxel of the measured volume]: a volume that varies freely explains also images that do not belong."""
 PART_LENSES = 3.0
 """Edge of the parts of a sensor [microlens pitch]: the light of a particle hardly reaches farther."""
 TURN_LENSES = 3
@@ -57,10 +54,13 @@ class Kind(enum.Enum):
     """The images of one camera are of another pair."""
     SHIFTED = "shifted"
     """The images of one camera are late by single images, so that its second frames stand as first ones."""
+    OTHER = "other"
+    """The image of one camera is one of other particles: no mistake, but a measure of chance."""
     CHANCE = "chance"
     """The images of one camera are turned by half a turn: no mistake, but a measure of chance."""
 
 
+NO_MISTAKE = (Kind.NONE, Kind.OTHER, Kind.CHANCE)
 IN_TIME = (Kind.FRAMES, Kind.LATE, Kind.SHIFTED)
 """Mistakes that replace images by others of the same camera."""
 FLIPS: Mapping[Kind, tuple[slice, slice]] = {
@@ -83,12 +83,12 @@ class Mistake:
     @property
     def named(self) -> bool:
         """Whether it is a mistake that may have been made."""
-        return self.kind not in (Kind.NONE, Kind.CHANCE)
+        return self.kind not in NO_MISTAKE
 
     def undone(self, shown: Shown, pair: int, frame: int) -> Images | None:
         """Return the images of a frame without the mistake; None where there are none."""
         images = shown(pair, frame)
-        if images is None or not self.named:
+        if images is None or self.kind in (Kind.NONE, Kind.CHANCE):
             return images
         if self.kind is Kind.CAMERAS:
             first, second = self.cameras
@@ -138,10 +138,10 @@ class ImageFit:
 
     def __init__(self, weights: Weights):
         self.weights = weights
-        finer = weights.volume.voxel_mm / weights.grid.voxel_mm
-        sieve = SIEVE_VOXEL * finer if finer > FREE else 0.0
-        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **(PLAIN | {"sieve_voxel": sieve})))
+        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **PLAIN))
         self._parts = {name: self._parts_of(name) for name in weights.cameras}
+        self.camera_of_part = np.concatenate([np.full(parts[2], name) for name, parts in self._parts.items()])
+        """Camera of each part that `unexplained` returns."""
 
     def unexplained(self, images: Images, turn: str | None = None) -> np.ndarray:
         """Return the unexplained light of each part of each sensor, over all light of the camera, shape (part,).
@@ -187,7 +187,12 @@ def advantage(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
 
     Under chance the differences of all parts have either sign. Frames that only one set has do not count.
     """
-    difference = np.concatenate([b - a for a, b in zip(one, other, strict=False)])
+    return _in_errors([b - a for a, b in zip(one, other, strict=False)])
+
+
+def _in_errors(differences: Sequence[np.ndarray]) -> float:
+    """Return the sum of differences over its standard error under chance."""
+    difference = np.concatenate(differences)
     scatter = float(np.sqrt(difference @ difference))
     return float(difference.sum()) / scatter if scatter > 0 else 0.0
 
@@ -200,6 +205,8 @@ class Judgement:
     """Mistake -> light that is unexplained without it, of each frame that was tried."""
     chance: Sequence[Mistake]
     """What replaces an image by one of other particles."""
+    camera_of_part: np.ndarray
+    """Camera of each part of the sensors, shape (part,)."""
     turned: Mapping[Mistake, Sequence[np.ndarray]] = field(default_factory=dict)
     """Mistake -> light that is unexplained without it and with an image turned, of the likeliest mistake."""
 
@@ -228,7 +235,7 @@ class Judgement:
         several parts. So the spread of their light counts, too. If a camera is late, the images as they are show other
         particles as well. Turned images leave more light than those of other particles, so they are the last resort.
         """
-        others = [self.left[one] for one in self.chance if one != best and one in self.left]
+        others = [self.left[one] for one in self.chance if one not in (best, *self._partners) and one in self.left]
         others += [self.left[RIGHT]] if best.kind in (Kind.LATE, Kind.SHIFTED) else []
         others = others or ([self.turned[best]] if best in self.turned else [])
         if not others:
@@ -245,10 +252,8 @@ class Judgement:
         Each frame beats chance, too. The order of frames does not count, since particles that hardly move fit in either
         order.
         """
-        for one in self.chance:
-            both = zip(self.left[RIGHT], self.left.get(one, ()), strict=False)
-            if min((advantage([mine], [others]) for mine, others in both), default=SURE) < SURE:
-                return False
+        if min((_in_errors([frame]) for frames in self._over_chance for frame in frames), default=SURE) < SURE:
+            return False
         wrong = [one for one in self.tried if one.kind not in IN_TIME]
         return not self.mistakes and self.over_chance > CLEAR and all(self.margin(one) > SURE for one in wrong)
 
@@ -260,7 +265,34 @@ class Judgement:
     @property
     def over_chance(self) -> float:
         """Return the least advantage of the images as they are over those of other particles [standard errors]."""
-        return min((self.margin(one) for one in self.chance if one in self.left), default=0.0)
+        return min((_in_errors(frames) for frames in self._over_chance), default=0.0)
+
+    @property
+    def _partners(self) -> list[Mistake]:
+        """What replaces the image of the second of two cameras."""
+        return [one for one in self.chance if one.kind is Kind.OTHER]
+
+    @property
+    def _over_chance(self) -> list[list[np.ndarray]]:
+        """Return by how much more light is unexplained in images beside those of other particles, of each frame.
+
+        An image may be explained better than another one whatever is beside it. So an image that is replaced by another
+        one does not count: the others do, with it and without it. Of two cameras each is replaced in turn.
+        """
+        found = []
+        for one in self.chance:
+            if one.kind is Kind.OTHER or one not in self.left:
+                continue
+            beside = [one, *(other for other in self._partners if other.late == one.late and other in self.left)]
+            each = [self._beside(replaced) for replaced in beside]
+            found.append([np.concatenate(frames) for frames in zip(*each, strict=False)])
+        return found
+
+    def _beside(self, one: Mistake) -> list[np.ndarray]:
+        counts = np.full(self.camera_of_part.shape, True)
+        if one.kind is not Kind.CHANCE:  # a turned image is no other one
+            counts = self.camera_of_part != one.cameras[0]
+        return [(b - a)[counts] for a, b in zip(self.left[RIGHT], self.left[one], strict=False)]
 
     def joined(self, other: Judgement) -> Judgement:
         """Return the judgement by the frames of both, about the mistakes that were tried in both."""
@@ -272,7 +304,7 @@ class Judgement:
 
         left = both(self.left, other.left)
         chance = [one for one in self.chance if one in left]
-        return Judgement(left, chance, both(self.turned, other.turned))
+        return Judgement(left, chance, self.camera_of_part, both(self.turned, other.turned))
 
 
 def judge(
@@ -313,7 +345,7 @@ def judge(
     """
     trials = _Trials(fit, shown, pair, others)
     cameras = list(fit.weights.cameras)
-    likely = [RIGHT, *trials.chance[: len(_one_of_two(cameras))], *likely_mistakes(cameras)]
+    likely = [RIGHT, *trials.chance[: len(cameras)], *likely_mistakes(cameras)]
     found = trials.judged(likely, 1)
     if not thorough and (settled := trials.settled(found, single_images=bool(images))) is not None:
         return settled
@@ -332,7 +364,8 @@ class _Trials:
         self._left: dict[Mistake, list[np.ndarray]] = {}
         cameras = list(fit.weights.cameras)
         late = [number for number in others if shown(pair + number, 0) is not None]
-        of_other_pairs = [Mistake(Kind.LATE, (name,), number) for number in late for name in _one_of_two(cameras)]
+        kinds = dict.fromkeys(cameras, Kind.LATE) | ({cameras[1]: Kind.OTHER} if len(cameras) == 2 else {})
+        of_other_pairs = [Mistake(kind, (name,), number) for number in late for name, kind in kinds.items()]
         self.chance = of_other_pairs or [Mistake(Kind.CHANCE, (name,)) for name in cameras]
         """What replaces an image by one of other particles."""
 
@@ -344,7 +377,7 @@ class _Trials:
                 if len(left) == frame and (right := one.undone(self._shown, self._pair, frame)) is not None:
                     left.append(self._fit.unexplained(right, one.cameras[0] if one.kind is Kind.CHANCE else None))
         known = {one: left for one, left in self._left.items() if left}
-        return Judgement(known, [one for one in self.chance if one in known])
+        return Judgement(known, [one for one in self.chance if one in known], self._fit.camera_of_part)
 
     def settled(self, found: Judgement, single_images: bool) -> Judgement | None:
         """Return the judgement if the images fit and at most the order of frames is in doubt, otherwise None.
@@ -354,7 +387,8 @@ class _Trials:
         if found.in_order and not single_images:
             return found
         if found.in_order:
-            found = self.judged([RIGHT, self.chance[0]], 2)  # no other pair has this second frame
+            beside = [one for one in self.chance if one.late == self.chance[0].late or not one.late]
+            found = self.judged([RIGHT, *beside[:2]], 2)  # no other pair has this second frame
             return found if found.fits else None
         if not found.fits:
             return None

@@ -148,6 +148,10 @@ class CameraVolumes:
             found = volume_on(solver.solve({name: images[name]}).to_dataarray(), self.weights.volume)
             self._volumes[name].append(_flattened(found.values))
 
+    def own(self) -> dict[str, list[np.ndarray]]:
+        """Return the volumes of each camera, flattened, one an instant, shape (z, y, x)."""
+        return self._volumes
+
     def each(self, instants: int) -> list[CameraVolumes]:
         """Return the volumes of each run of so many instants alone."""
         count = len(next(iter(self._volumes.values())))
@@ -175,7 +179,7 @@ class CameraVolumes:
             if in_middle is not None:
                 parts = [
                     _disparity(volumes, window, grid, pair, slanted, near_mm=in_middle.shift_mm)
-                    for window in _windows(grid)
+                    for window in cut_into_windows(grid)
                 ]
                 found += [part for part in parts if part is not None] or [in_middle]
         return tuple(found)
@@ -233,7 +237,7 @@ def unlinked(found: Sequence[Disparity], cameras: Iterable[str]) -> list[str]:
     return [name for name in cameras if name not in linked]
 
 
-def _windows(grid: Grid) -> list[tuple[slice, ...]]:
+def cut_into_windows(grid: Grid) -> list[tuple[slice, ...]]:
     """Cut the volume into windows, (z, y, x)."""
     counts = [int(np.clip(edge // WINDOW_VOXEL, 1, MOST_WINDOWS)) for edge in grid.shape]
     edges = [np.linspace(0, edge, count + 1).astype(int) for edge, count in zip(grid.shape, counts, strict=True)]
@@ -263,8 +267,8 @@ def _disparity(
     axes = (
         (1,) if slanted[1, 1] < LEVEL else (0, 1, 2)
     )  # mirrors that keep the lines of sight: along y, or in the middle
-    mirrored_window = _mirror(window, grid.shape, axes)
-    mirrored = masked_correlation(first, [np.flip(volume, axes) for volume in second], mirrored_window, centre, reach)
+    opposite = mirrored_window(window, grid.shape, axes)
+    mirrored = masked_correlation(first, [np.flip(volume, axes) for volume in second], opposite, centre, reach)
     coefficient, mirrored = (_along(values, slanted) for values in (coefficient, mirrored))
     lags = np.indices(coefficient.shape).reshape(3, -1) - reach + centre[:, None]
     searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL
@@ -274,7 +278,7 @@ def _disparity(
     peak, rival = float(coefficient[place]), float(mirrored[searched].max())
     if not peak >= SIGNIFICANT * rival:
         return None
-    fitted = _peak(coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in place)])
+    fitted = fit_peak(coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in place)])
     if fitted is None:
         return None
     offset, curvature = fitted
@@ -300,7 +304,7 @@ def _along(coefficient: np.ndarray, slanted: np.ndarray) -> np.ndarray:
     return averaged
 
 
-def _peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def fit_peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Fit a paraboloid to coefficients around a peak; return its place and curvature (x, y, z), None without a peak.
 
     In the plane of the lines of sight a peak may be a ridge. Its place there is limited to the fitted lags.
@@ -320,7 +324,7 @@ def _peak(around: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     return axes @ np.clip(along, -FIT_REACH, FIT_REACH), axes * sizes @ axes.T
 
 
-def _mirror(window: tuple[slice, ...], shape: tuple[int, ...], axes: tuple[int, ...]) -> tuple[slice, ...]:
+def mirrored_window(window: tuple[slice, ...], shape: tuple[int, ...], axes: tuple[int, ...]) -> tuple[slice, ...]:
     """Return the window of the same voxels in a volume that is mirrored along axes."""
     return tuple(
         slice(n - part.stop, n - part.start) if axis in axes else part

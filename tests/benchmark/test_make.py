@@ -171,6 +171,16 @@ def test_a_truth_that_a_killed_command_left_does_not_stop_the_same_command(made,
     assert not list(tmp_path.iterdir())
 
 
+def test_a_case_that_another_command_made_meanwhile_stays(made, tmp_path):
+    def other(step, fraction):
+        if not (tmp_path / "data").exists():
+            shutil.copytree(made.folder, tmp_path / "data")
+
+    with pytest.raises(InputError, match="expected an empty or absent folder"):
+        make(["trial"], tmp_path / "data", truth=tmp_path / "secret", progress=other)
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
 def test_folders_that_cannot_be_are_refused_before_work(tmp_path):
     for out, truth in (("data", "data/secret"), ("data", "data"), ("secret/data", "secret")):
         with pytest.raises(InputError, match="outside"):

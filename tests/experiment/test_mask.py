@@ -1,5 +1,7 @@
 """Masks of an experiment: files of any grid, half-spaces and boxes, and messages for those that cannot be meant."""
 
+import gc
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -151,6 +153,16 @@ def test_a_file_that_is_no_netcdf_is_named(tmp_path):
     (tmp_path / "mask.nc").write_text("no mask")
     with pytest.raises(InputError, match="expected a NetCDF file"):
         read_mask(tmp_path / "mask.nc", GRID)
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+def test_a_file_with_a_damaged_beginning_is_named_without_a_traceback_beside_it(tmp_path):
+    path = stored(tmp_path / "mask.nc", ball, 0.05)
+    content = path.read_bytes()
+    path.write_bytes(b"\0" + content[1:])
+    with pytest.raises(InputError, match="expected a NetCDF file"):
+        read_mask(path, GRID)
+    gc.collect()  # h5netcdf complains when half an object is collected
 
 
 def moving(path, x_mm, *, reach=0.6):

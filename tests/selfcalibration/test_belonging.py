@@ -9,6 +9,7 @@ import tifffile
 import xarray as xr
 
 import lfpiv
+from lfpiv.calibration.camera import Calibration
 from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.runs.reversed_pairs import reversed_pairs
@@ -84,6 +85,21 @@ def test_images_of_other_particles_do_not_fit(rig, shown):
         return None if images is None else {**images, "left": np.flipud(np.roll(images["left"], 25, axis=1))}
 
     assert not judged(rig, foreign).fits
+
+
+@pytest.mark.parametrize("pair", range(4))
+def test_images_of_another_pair_do_not_fit_however_well_they_are_explained(rig, shown, pair):
+    """Images of few particles leave little light: pair 2 beside pair 1 leaves less than others."""
+    experiment, _ = rig
+    calibration = Calibration(rig[1].cameras)
+    weights = lfpiv.build_weights(calibration, experiment.grid.refined(2.0))
+
+    def late(number, frame):
+        images = shown(number, frame)
+        return None if images is None else {**images, "right": shown((number - 1) % 4, frame)["right"]}
+
+    near = [late for late in (1, -1, 2, -2) if pair + late in experiment.numbers]
+    assert not judge(ImageFit(weights), late, pair, near, [], images=(1, -1)).fits
 
 
 def test_one_camera_cannot_be_checked_and_that_is_said(rig):
