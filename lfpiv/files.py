@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv.errors import StorageError
+from lfpiv.errors import InputError, StorageError
 from lfpiv.version import history
 
 MIB = 1 << 20
@@ -89,6 +89,12 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def require_empty(folder: Path) -> None:
+    """Raise InputError unless a folder is empty or absent."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: expected an empty or absent folder to write to, found files. Name another folder.")
 
 
 @contextlib.contextmanager

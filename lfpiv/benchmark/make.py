@@ -29,7 +29,7 @@ from lfpiv.benchmark.plain_truth import (
 from lfpiv.benchmark.readme import README, readme
 from lfpiv.benchmark.truth import ABOUT, TRUTH
 from lfpiv.errors import InputError
-from lfpiv.files import remove_leftovers, replacing_folder, scratch_path, write_json, writing
+from lfpiv.files import remove_leftovers, replacing_folder, require_empty, scratch_path, write_json, writing
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.records import RecordError, read_object, read_text
 from lfpiv.results.datasets import write_dataset
@@ -137,7 +137,7 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
     if not folder.exists() and _is_of(_about_of(truth), case, scene):
         shutil.rmtree(truth)  # of a command that was killed between truth and data
     for place in (folder, truth):
-        _require_empty(place)
+        require_empty(place)
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         truth.parent.mkdir(parents=True, exist_ok=True)
@@ -146,7 +146,7 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
         scratch.mkdir()
         try:
             made = _write(case, scene, scratch / "data", folder, truth, lambda _, done: progress(case.name, done))
-            _require_empty(folder)  # another command may have made it meanwhile
+            require_empty(folder)  # another command may have made it meanwhile
             if truth != folder / TRUTH:
                 _move(scratch / "data" / TRUTH, truth)
             os.replace(scratch / "data", folder)
@@ -155,11 +155,6 @@ def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress:
     if made.verdict == "differs":
         log.warning("%s: images or truth differ from the recorded ones: %s", case.name, made.reason or "same versions")
     return made
-
-
-def _require_empty(place: Path) -> None:
-    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
-        raise InputError(f"{place}: expected an empty or absent folder to write to, found files. Name another one.")
 
 
 def _overlap(one: Path, other: Path) -> bool:

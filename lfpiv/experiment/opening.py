@@ -86,7 +86,7 @@ def read_experiment(path: str | Path) -> Experiment:
         self_calibration=table.self_calibration,
         bootstrap=table.bootstrap,
         correlation=table.correlation,
-        tracking=table.tracking_of(len(cameras)),
+        tracking=table.used_tracking,
         network=table.network,
         compute=table.compute,
         particle_images=particles.images,

@@ -49,7 +49,7 @@ def fault(image: np.ndarray) -> str | None:
 
 
 def _varies(values: np.ndarray) -> bool:
-    """Return whether no value is that of more than `LARGEST_SHARE` of the pixels."""
+    """Return whether no single value fills more than `LARGEST_SHARE` of the pixels."""
     return values.size > 0 and bool(np.bincount(values).max() <= LARGEST_SHARE * values.size)
 
 

@@ -25,7 +25,7 @@ Fields = dict[str, np.ndarray]
 
 
 def draw_vorticity(panels: Mapping[str, Fields], path: Path) -> None:
-    """Draw the field of windows of 8 voxels of each mapping to a file; colours are those of the true particles."""
+    """Draw the field of windows of 8 voxels of each mapping to a file, coloured as the true particles."""
     drawn = plots.figure(11, 8.4)
     drawn.set_layout_engine("constrained", w_pad=0.2, h_pad=0.2)
     drawings = []

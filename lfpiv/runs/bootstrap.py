@@ -64,7 +64,7 @@ def decide(
     """
     if not experiment.simulated_pairs:
         if experiment.by_links:
-            log.info("damping by ghosts: not measured, since ghosts do not damp vectors of linked particles")
+            log.info("damping by ghosts: not measured where linked particles give the vectors")
         elif experiment.bootstrap.pairs:
             why = "since a joint fit hardly damps" if experiment.is_joint else "in so short a run"
             log.info("damping by ghosts: not measured %s; set bootstrap.pairs to measure it", why)

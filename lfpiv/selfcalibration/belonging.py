@@ -274,7 +274,7 @@ class Judgement:
 
     @property
     def _over_chance(self) -> list[list[np.ndarray]]:
-        """Return by how much more light is unexplained in images beside those of other particles, of each frame.
+        """Return how much more light images of other particles leave unexplained beside the images, of each frame.
 
         An image may be explained better than another one whatever is beside it. So an image that is replaced by another
         one does not count: the others do, with it and without it. Of two cameras each is replaced in turn.

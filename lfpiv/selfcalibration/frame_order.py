@@ -1,9 +1,9 @@
 """Order of frames: what the frames of each camera alone say about which of them is first.
 
 The volumes of a single camera show every particle, elongated along the line of sight. Those of its two frames correlate
-at the displacement of the particles. Across the lines of sight of two cameras both see it alike. Where its signs are
-opposite, the frames of one of the cameras are exchanged. Dense particles, whose volumes explain images in any order, do
-not hide this.
+at the displacement of the particles. Two cameras see the same displacement across both lines of sight. Where its signs
+are opposite, one camera's frames are exchanged. This shows in dense seeding, too, where a volume explains images in any
+order.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def own_motion(volumes: Mapping[str, Sequence[np.ndarray]], grid: Grid) -> Motio
 
 
 def exchanged(motions: Sequence[Motion], cameras: Mapping[str, CalibratedCamera], grid: Grid) -> tuple[str, ...]:
-    """Return the camera whose displacements in some pairs are opposite to those of all others; of two cameras both.
+    """Return the camera whose particles move opposite to every other camera's; both of two cameras.
 
     Empty where the order is right, or is not told.
     """

@@ -34,6 +34,7 @@ class ExperimentTable(Table):
     bootstrap: Bootstrap = Bootstrap()
     compute: Compute = Compute()
 
-    def tracking_of(self, cameras: int) -> Tracking | None:
-        """Return the settings of the tracking, which a single camera has without a table; None without tracking."""
-        return Tracking() if self.tracking is None and cameras == 1 else self.tracking
+    @property
+    def used_tracking(self) -> Tracking | None:
+        """Settings of the tracking, which a single camera has without a table; None without tracking."""
+        return Tracking() if self.tracking is None and len(self.camera) == 1 else self.tracking

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.files import remove_leftovers, replacing_folder
+from lfpiv.files import remove_leftovers, replacing_folder, require_empty
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.simulation import truth
 from lfpiv.simulation.camera_images import (
@@ -95,8 +95,7 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     for camera in scene.camera:
         _check_positions(scene, camera, np.concatenate(places))
     out = Path(out)
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise InputError(f"{out}: expected an empty or absent folder to write to, found files. Name another folder.")
+    require_empty(out)
     remove_leftovers(out.parent, f".{glob.escape(out.name)}.*.tmp")
     with replacing_folder(out) as scratch:
         try:

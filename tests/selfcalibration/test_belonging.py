@@ -90,9 +90,8 @@ def test_images_of_other_particles_do_not_fit(rig, shown):
 @pytest.mark.parametrize("pair", range(4))
 def test_images_of_another_pair_do_not_fit_however_well_they_are_explained(rig, shown, pair):
     """Images of few particles leave little light: pair 2 beside pair 1 leaves less than others."""
-    experiment, _ = rig
-    calibration = Calibration(rig[1].cameras)
-    weights = lfpiv.build_weights(calibration, experiment.grid.refined(2.0))
+    experiment, coarse = rig
+    weights = lfpiv.build_weights(Calibration(coarse.cameras), experiment.grid.refined(2.0))
 
     def late(number, frame):
         images = shown(number, frame)
