@@ -137,9 +137,9 @@ def _check_numbers(vectors: xr.Dataset) -> None:
     """Refuse axes that do not increase, and valid vectors that are no numbers."""
     for axis in AXES:
         _check_axis(vectors[axis])
-    valid = vectors["valid"]
+    valid = vectors["valid"].values
     for name in "uvw":
-        values = vectors[name]
+        values = vectors[name].values
         if values.dtype.kind not in "fiu":
             raise ValueError(f"vectors: expected {name!r} to be numbers, found {values.dtype}.")
         if wrong := int((valid & ~np.isfinite(values)).sum()):

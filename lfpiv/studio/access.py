@@ -47,6 +47,8 @@ class Token:
                 response = await handler(request)
             except web.HTTPException as error:
                 response = error
+            except ConnectionError:  # the page was closed while something was sent to it
+                response = web.Response()
             if asked and not response.prepared:
                 response.set_cookie(name, self.word, httponly=True, samesite="Strict")
             if not response.prepared:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -131,7 +131,7 @@ class RawImages:
     def marked_pixels(self, camera: str, image: np.ndarray) -> dict[str, np.ndarray]:
         """Return saturated and hot pixels of an image as it is read, each (n, 2) in the recorded picture."""
         clipped = saturated_pixels(image, self.experiment.camera(camera).white_level)
-        around = ndimage.maximum_filter(image, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
+        around = scipy.ndimage.maximum_filter(image, footprint=np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
         noise = NORMAL_MAD * float(np.median(np.abs(np.diff(image[:, ::7], axis=0)))) / np.sqrt(2)
         level = float(np.percentile(image[::5, ::5], 5))
         hot = image - level > HOT_RATIO * np.maximum(around - level, 0) + HOT_SIGMA * max(noise, 1.0)
@@ -214,7 +214,7 @@ class RawImages:
         fan = found.map_fan(points, pupil)
         for number in range(len(pupil)):
             at = (fan[:, number] - origin) @ basis - low
-            value = ndimage.map_coordinates(stack[number], at.T, order=1, cval=np.nan, prefilter=False)
+            value = scipy.ndimage.map_coordinates(stack[number], at.T, order=1, cval=np.nan, prefilter=False)
             total += np.nan_to_num(value)
             seen += np.isfinite(value)
         mean = np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)

@@ -39,6 +39,12 @@ def quiet_vtk() -> None:
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
 
 
+def quiet_closed_pages() -> None:
+    """Let the server of messages not log that a page was closed while something was sent to it."""
+    known = logging.getLogger("wslink.protocol")
+    known.addFilter(lambda _: not isinstance(sys.exc_info()[1], ConnectionError))
+
+
 def serve(
     path: str | Path | None = None,
     *,
@@ -71,6 +77,7 @@ def serve(
     if not given.exists():
         raise InputError(f"{given}: expected an experiment file or the results of a run, found nothing there.")
     quiet_vtk()
+    quiet_closed_pages()
     token = access.Token()
     session = page.build(given.resolve())
     server = session.server

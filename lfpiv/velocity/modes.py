@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import fft
+import scipy  # loads its parts where they are used: readers of results need no transform
 
 SHELL_WIDTH = 0.1
 """Width of the shells of wave numbers [1 / distance of windows]."""
@@ -13,13 +13,13 @@ SHELL_WIDTH = 0.1
 
 def modes_of(field: np.ndarray) -> np.ndarray:
     """Return the discrete cosine transform of the fluctuations of a finite field along its first three axes."""
-    modes: np.ndarray = fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
+    modes: np.ndarray = scipy.fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
     return modes
 
 
 def field_of(modes: np.ndarray) -> np.ndarray:
     """Return the fluctuations whose modes are given."""
-    field: np.ndarray = fft.idctn(modes, axes=(0, 1, 2), norm="ortho")
+    field: np.ndarray = scipy.fft.idctn(modes, axes=(0, 1, 2), norm="ortho")
     return field
 
 

@@ -1,5 +1,7 @@
 """Trust: the studio opens nothing outside its folders, and runs are started once and stopped as by Ctrl-C."""
 
+import asyncio
+import logging
 import os
 import signal
 import subprocess
@@ -24,6 +26,34 @@ def test_places_outside_the_folders_are_refused(tmp_path):
     for wrong in ("..", str(outside), "link/results", "/etc/passwd", "a/../../outside"):
         with pytest.raises(InputError, match="expected a place in"):
             places.within(wrong)
+
+
+def test_a_page_that_closes_while_pictures_come_logs_nothing(caplog):
+    from aiohttp import web
+    from aiohttp.test_utils import make_mocked_request
+
+    from lfpiv.studio.access import Token
+    from lfpiv.studio.server import quiet_closed_pages
+
+    token, messages = Token(), logging.getLogger("wslink.protocol")
+    quiet_closed_pages()
+
+    def fails(error):
+        async def handler(request):
+            try:
+                raise error
+            except type(error):
+                messages.error("Exception raised")
+                raise
+
+        request = make_mocked_request("GET", f"/ws?token={token.word}", headers={"Host": "127.0.0.1:80"})
+        return asyncio.run(token.middleware()(request, handler))
+
+    assert isinstance(fails(ConnectionResetError("Cannot write to closing transport")), web.Response)
+    assert not caplog.records
+    with pytest.raises(ValueError, match="a fault"):
+        fails(ValueError("a fault"))
+    assert [record.message for record in caplog.records] == ["Exception raised"]
 
 
 def test_a_held_folder_gets_no_second_run(tmp_path):
