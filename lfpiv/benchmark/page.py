@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -102,15 +101,7 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
         "".join(markup.paragraph(text) for text in figures.SOURCES.values()),
         markup.paragraph(f"Scored by {SOURCE}.", "quiet"),
     ]
-    style = (importlib.resources.files("lfpiv.report") / "static" / "report.css").read_text("utf-8")
-    files.write_text(
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>{markup.escape(truth.scene.name)}: scores</title>"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
-        f"<style>{style}</style></head><body><main>\n" + "\n".join(body) + "\n</main></body></html>\n",
-        path,
-    )
+    files.write_text(markup.page(f"{truth.scene.name}: scores", body), path)
 
 
 def completeness_panel(scores: Sequence[Score]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import importlib.resources
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -12,6 +13,7 @@ from lfpiv.quantities import significant
 
 __all__ = [
     "NONE",
+    "asset",
     "count",
     "details",
     "escape",
@@ -19,11 +21,29 @@ __all__ = [
     "figure",
     "general",
     "number",
+    "page",
     "paragraph",
     "percent",
     "significant",
     "table",
 ]
+
+
+def page(title: str, body: Iterable[str], scripts: str = "") -> str:
+    """Return a whole page that needs no other file, with `scripts` behind its text."""
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
+        f"<style>{asset('report.css')}</style></head><body><main>\n"
+        + "\n".join(body)
+        + f"\n</main>{scripts}</body></html>\n"
+    )
+
+
+def asset(name: str) -> str:
+    """Return the text of a file in ``static``."""
+    return (importlib.resources.files("lfpiv.report") / "static" / name).read_text("utf-8")
 
 
 def figure(panels: Sequence[str], caption: str, numbers: str = "", *, title: str = "Numbers") -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import importlib.resources
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,22 +88,9 @@ def write_report(
         overview.contents(sections, recording.noun),
         *sections.values(),
     ]
-    scripts = "\n".join(_asset(name) for name in _SCRIPTS)
-    files.write_text(
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f"<title>{markup.escape(experiment.name)}: light-field PIV</title>"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
-        f"<style>{_asset('report.css')}</style></head><body><main>\n"
-        + "\n".join(body)
-        + f"\n</main>\n{_plotly() if vectors else ''}<script>\n{scripts}</script></body></html>\n",
-        path,
-    )
-
-
-def _asset(name: str) -> str:
-    """Return the text of a file in ``static``."""
-    return (importlib.resources.files("lfpiv.report") / "static" / name).read_text("utf-8")
+    scripts = "\n".join(markup.asset(name) for name in _SCRIPTS)
+    drawn = f"\n{_plotly() if vectors else ''}<script>\n{scripts}</script>"
+    files.write_text(markup.page(f"{experiment.name}: light-field PIV", body, drawn), path)
 
 
 def _plotly() -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 import logging
 import shutil
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv import files
+from lfpiv.quantities import duration
+from lfpiv.report import markup
 
 log = logging.getLogger(__name__)
 
@@ -119,40 +120,6 @@ def write(out: Path, settings: Mapping[str, Any], title: str, about: str, keys: 
 ROUNDING = 1e-12
 """Magnitude below which a number is shown as 0."""
 
-STYLE = """
-:root { --ink: #1d2329; --dim: #5c6670; --line: #d9dee3; --paper: #fff; --good: #1f7a4d; --bad: #b3431e; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --dim: #a0a9b2; --line: #3a4249; --paper: #15191d; --good: #58c58f; --bad: #f0906a; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1rem; max-width: 62rem; color: var(--ink); background: var(--paper);
-  font: 1rem/1.5 system-ui, sans-serif; }
-h1 { font-size: 1.5rem; line-height: 1.25; margin: .5rem 0; }
-h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; padding-top: .8rem; border-top: 1px solid var(--line); }
-p, li, figcaption, dd { max-width: 44rem; }
-.dim, figcaption, .caption { color: var(--dim); font-size: .9rem; }
-.caption { margin: 1.1rem 0 .2rem; }
-nav { font-size: .9rem; margin: 1rem 0; }
-nav ul { margin: .2rem 0; padding-left: 1.1rem; }
-details { margin: 1rem 0; } summary { cursor: pointer; }
-dl { font-size: .9rem; margin: .5rem 0; } dt { font-weight: 600; } dd { margin: 0 0 .4rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; margin: .4rem 0 .6rem; }
-th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-weight: 600; }
-td:first-child:not(.number, .case) { min-width: 7rem; }
-td.what { min-width: 11rem; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-th.number { text-align: right; }
-.yes { color: var(--good); font-weight: 600; } .no { color: var(--bad); font-weight: 600; }
-figure { margin: 1rem 0; }
-figure img { max-width: 100%; height: auto; background: #fff; display: block; }
-@media (max-width: 40rem) { body { padding: .7rem; } table { font-size: .8rem; } th, td { padding-right: .45rem; }
-  td.what, td:first-child:not(.number, .case) { min-width: 6.5rem; }
-  figure img { max-width: none; width: 44rem; } }
-"""
-
-
 TERMS = {
     "pitch, voxel": "One microlens, and one voxel of 0.1 mm: as large as a microlens seen in the volume.",
     "ppm": "Particles per microlens of the volume's x-y face.",
@@ -173,96 +140,65 @@ def _page(out: Path, content: Mapping[str, Any], title: str, about: str, keys: S
     rows = [{"case": key, **row} for key in present for row in content[key]["comparison"]]
     judged = [row["reached"] for row in rows if row["reached"] is not None]
     missing = [key for key in keys if key not in content]
-    parts = [
-        f"<h1>{html.escape(title)}</h1>",
-        f"<p>{html.escape(about)}, computed by lfpiv "
-        f"{html.escape(str(content['version']))} on simulated images: scale <b>{content['scale']}</b>, seed "
-        f"{content['seed']}. {sum(judged)} of {len(judged)} goals reached. Cameras are calibrated from simulated "
-        "images, volumes are reconstructed and measured. Only the simulator knows the truth. "
-        "<a href='reproduce.json'>reproduce.json</a> holds all figures.</p>",
-    ]
-    if missing:
-        parts.append(f"<p class='dim'>Not computed yet: {', '.join(missing)}.</p>")
-    links = "".join(f"<li><a href='#{key}'>{html.escape(content[key]['title'])}</a></li>" for key in present)
-    parts.append(f"<nav aria-label='contents'><ul>{links}</ul></nav>")
-    terms = "".join(f"<dt>{html.escape(word)}</dt><dd>{html.escape(text)}</dd>" for word, text in TERMS.items())
-    parts.append(f"<details><summary>What the words mean</summary><dl>{terms}</dl></details>")
-    parts += [_comparison([row for row in rows if row["goal"]], cases=True)] if judged else []
-    parts += [_section(out, key, content[key]) for key in present]
-    return (
-        "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>lfpiv: {html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
-        + "\n".join(parts)
-        + "\n</body></html>\n"
+    links = "".join(f'<a href="#{key}">{markup.escape(content[key]["title"].partition(":")[0])}</a>' for key in present)
+    return markup.page(
+        f"lfpiv: {title}",
+        [
+            f"<h1>{markup.escape(title)}</h1>",
+            f"<p>{markup.escape(about)}, computed by lfpiv {markup.escape(str(content['version']))} on simulated "
+            f"images: scale <b>{content['scale']}</b>, seed {content['seed']}. {sum(judged)} of {len(judged)} goals "
+            "reached. Cameras are calibrated from simulated images, volumes are reconstructed and measured. Only the "
+            'simulator knows the truth. <a href="reproduce.json">reproduce.json</a> holds all figures.</p>',
+            markup.paragraph(f"Not computed yet: {', '.join(missing)}.", "quiet") if missing else "",
+            f'<nav aria-label="contents">{links}</nav>',
+            markup.details("What the words mean", markup.facts(TERMS.items())),
+            _comparison("all figures with a goal", [row for row in rows if row["goal"]]) if judged else "",
+            *(_section(out, key, content[key]) for key in present),
+        ],
     )
 
 
 def _section(out: Path, key: str, case: Mapping[str, Any]) -> str:
-    seconds = case["time"]
-    parts = [
-        f"<h2 id='{key}'>{html.escape(case['title'])}</h2>",
-        f"<p class='dim'>{key}; took {_duration(seconds['wall_s'])}, {_duration(seconds['cpu_s'])} of processor "
-        "time.</p>",
-        _comparison(case["comparison"]) if case["comparison"] else "",
-    ]
+    spent = f"took {duration(case['time']['wall_s'])}, {duration(case['time']['cpu_s'])} of processor time"
+    parts = [f'<h2 id="{key}">{markup.escape(case["title"])}</h2>', markup.paragraph(f"{key}; {spent}.", "quiet")]
+    if case["comparison"]:
+        parts.append(_comparison(f"figures of {key}", case["comparison"]))
     for figure in case["figures"]:
-        caption = html.escape(figure["caption"])
+        caption = markup.escape(figure["caption"])
         image = base64.b64encode((out / figure["file"]).read_bytes()).decode("ascii")
         parts.append(
-            f"<figure><div class='scroll'><img alt='{html.escape(figure['caption'], quote=True)}' "
-            f"src='data:image/png;base64,{image}'></div><figcaption>{caption}</figcaption></figure>"
+            f'<figure><div class="scroll"><img style="max-width: max(100%, 44rem); background: #fff" alt="{caption}" '
+            f'src="data:image/png;base64,{image}"></div><figcaption>{caption}</figcaption></figure>'
         )
-    parts += [_table(table["caption"], table["columns"], table["rows"]) for table in case["tables"]]
-    if case["notes"]:
-        parts.append("<ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in case["notes"]) + "</ul>")
-    return "\n".join(parts)
+    for table in case["tables"]:
+        parts.append(f'<p class="caption">{markup.escape(table["caption"])}</p>')
+        rows = ([_text(value) for value in row] for row in table["rows"])
+        parts.append(markup.table(table["columns"], rows, caption=table["caption"]))
+    notes = "".join(f"<li>{markup.escape(note)}</li>" for note in case["notes"])
+    return "\n".join([*parts, f"<ul>{notes}</ul>" if notes else ""])
 
 
-def _comparison(rows: Sequence[Mapping[str, Any]], *, cases: bool = False) -> str:
+def _comparison(caption: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of rows made by `compare`; those of several cases begin with the name of their case."""
     shown = [name for name in ("paper", "goal") if any(row[name] is not None for row in rows)]
-    columns = (["case"] if cases else []) + ["what", "ours", *shown] + (["met"] if "goal" in shown else [])
+    met = {None: "", True: "✓\u00a0yes", False: "✗\u00a0no"}
     body = []
     for row in rows:
-        unit = f" [{row['unit']}]" if row["unit"] else ""
-        verdict = {None: "", True: "<span class='yes'>yes</span>", False: "<span class='no'>no</span>"}[row["reached"]]
-        cells = [f"<td class='case'><a href='#{row['case']}'>{row['case']}</a></td>"] if cases else []
-        cells.append(f"<td class='what'>{html.escape(row['what'] + unit)}</td>")
-        figures = [_text(row[name]).replace("&lt;=", "≤").replace("&gt;=", "≥") for name in ("ours", *shown)]
-        cells += [f"<td class='number'>{figure}</td>" for figure in figures]
-        cells += [f"<td>{verdict}</td>"] if "goal" in shown else []
-        body.append(f"<tr>{''.join(cells)}</tr>")
-    heads = "".join(
-        f"<th{' class=number' if name in ('ours', 'paper', 'goal') else ''}>{name}</th>" for name in columns
-    )
-    return f"<div class='scroll'><table><thead><tr>{heads}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
-
-
-def _table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    numeric = [all(not isinstance(row[k], str) for row in rows) for k in range(len(columns))]
-    mark = [" class='number'" if number else "" for number in numeric]
-    head = "".join(f"<th{mark[k]}>{html.escape(name)}</th>" for k, name in enumerate(columns))
-    body = "".join(
-        "<tr>" + "".join(f"<td{mark[k]}>{_text(value)}</td>" for k, value in enumerate(row)) + "</tr>" for row in rows
-    )
-    return (
-        f"<p class='caption'>{html.escape(caption)}</p><div class='scroll'>"
-        f"<table aria-label='{html.escape(caption, quote=True)}'><thead><tr>{head}</tr></thead>"
-        f"<tbody>{body}</tbody></table></div>"
-    )
+        what = (
+            (f"{row['case']}: " if "case" in row else "") + row["what"] + (f" [{row['unit']}]" if row["unit"] else "")
+        )
+        figures = [_text(row[name]).replace("<= ", "≤\u00a0").replace(">= ", "≥\u00a0") for name in ("ours", *shown)]
+        body.append([what, *figures, *([met[row["reached"]]] if "goal" in shown else [])])
+    return markup.table(["", "ours", *shown, *(["met"] if "goal" in shown else [])], body, caption=caption)
 
 
 def _text(value: Any) -> str:
     if value is None:
-        return "–"
+        return markup.NONE
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float) and abs(value) < ROUNDING:
         return "0"
     if isinstance(value, float):
         return f"{value:.{4 if abs(value) >= 0.1 else 3}g}" if abs(value) < 1e5 else f"{value:.3e}"
-    return html.escape(str(value))
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+    return str(value)

@@ -82,8 +82,8 @@ def test_results_are_kept_shown_and_resumed(cases, tmp_path):
     text = (tmp_path / "index.html").read_text()
     assert "1 of 3 goals reached" in text and "good &amp; co" in text and "1 &lt; 2" in text
     assert "reached &lt;b&gt;" in text and "<b>" not in text.replace("<b>small</b>", "")
-    assert text.count("data:image/png;base64,") == 1 and "name='viewport'" in text
-    assert not re.search(r"(src|href)='(?!data:|#|reproduce\.json)", text), "the page needs other files"
+    assert text.count("data:image/png;base64,") == 1 and 'name="viewport"' in text
+    assert not re.search(r'(src|href)="(?!data:|#|reproduce\.json)', text), "the page needs other files"
 
 
 def test_folders_of_other_settings_and_bad_requests_are_refused(cases, tmp_path):
