@@ -9,21 +9,16 @@ from lfpiv_kernels.launch import Call
 wp.set_module_options(native.options("blocks_gpu.h", contract="fast", gpu=True))
 
 
-@wp.func_native("lfpiv::correlate_lane(first, second, layers, task, sum_out.data);")
-def _correlate_lane(first: Phased, second: Phased, layers: Layers, task: int, sum_out: wp.array(dtype=float)): ...
-
-
-@wp.kernel(cuda_max_registers=64)
+@native.kernel("lfpiv::correlate_lane(first, second, layers, task, sum_out.data);", registers=64)
 def _correlate_lanes(
     # in
     first: Phased,  # blocks of the first volume
     second: Phased,  # their surroundings in the second volume, from the farthest lag on
     layers: Layers,  # a thread per lane, lag along y, lag along z and layer
-    begin: int,
+    first_task: int,
     # out
     sum_out: wp.array(dtype=float),  # sums of products, (layer, lag, lane)
-):
-    _correlate_lane(first, second, layers, begin + wp.tid(), sum_out)
+): ...
 
 
 def correlation_call(first: Phased, second: Phased, layers: Layers, count: int, sums: wp.array) -> Call:

@@ -9,34 +9,23 @@ from lfpiv_kernels.launch import Call
 wp.set_module_options(native.options("neighbours_gpu.h"))
 
 
-@wp.func_native(
-    "lfpiv::predict_vector(field.data, keep.data, points.data, shape, task, prediction_out.data, count_out.data);"
+@native.kernel(
+    "lfpiv::predict_vector(field.data, keep.data, points.data, shape, task, prediction_out.data, count_out.data);",
+    "task",
+    "_lane",
+    registers=64,
 )
-def _predict_one(
-    field: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    points: wp.array(dtype=int),
-    shape: wp.vec3i,
-    task: int,
-    prediction_out: wp.array(dtype=float),
-    count_out: wp.array(dtype=int),
-): ...
-
-
-@wp.kernel(cuda_max_registers=64)
 def _predict_vectors(
     # in
     field: wp.array(dtype=float),  # as in `_predict`; a warp per component of a vector
     keep: wp.array(dtype=int),
     points: wp.array(dtype=int),
     shape: wp.vec3i,
-    first: int,
+    first_task: int,
     # out
     prediction_out: wp.array(dtype=float),
     count_out: wp.array(dtype=int),
-):
-    task, _lane = wp.tid()
-    _predict_one(field, keep, points, shape, first + task, prediction_out, count_out)
+): ...
 
 
 def prediction_call(inputs: list[object], outputs: list[wp.array]) -> Call:

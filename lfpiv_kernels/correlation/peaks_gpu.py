@@ -19,19 +19,9 @@ FLOATS_OF_SECTOR: int = native.constant("projector_gpu.h", "SECTOR") // 4
 """Floats that memory moves at once; the coefficients of a window begin such a sector."""
 
 
-@wp.func_native("lfpiv::score_windows(sums, first, second, windows, count, task, score_out.data);")
-def _score(
-    sums: Sums,
-    first: Statistics,
-    second: Statistics,
-    windows: Windows,
-    count: int,
-    task: int,
-    score_out: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel(cuda_max_registers=64)
+@native.kernel(
+    "lfpiv::score_windows(sums, first, second, windows, count, task, score_out.data);", "task", "_lane", registers=64
+)
 def _score_windows(
     # in
     sums: Sums,
@@ -39,12 +29,10 @@ def _score_windows(
     second: Statistics,  # at every lag
     windows: Windows,
     count: int,  # windows; a warp per lag and 32 windows
-    begin: int,
+    first_task: int,
     # out
     score_out: wp.array(dtype=float),  # coefficients, (layer, lane, lag)
-):
-    task, _lane = wp.tid()
-    _score(sums, first, second, windows, count, begin + task, score_out)
+): ...
 
 
 @native.kernel(

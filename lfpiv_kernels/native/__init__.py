@@ -58,11 +58,12 @@ def options(header: str, *, contract: str | None = None, unroll: int = 0, gpu: b
     return chosen | quiet_options(flags)
 
 
-def kernel(call: str, *threads: str) -> Callable[[Callable[..., None]], wp.Kernel]:
+def kernel(call: str, *threads: str, registers: int = 0) -> Callable[[Callable[..., None]], wp.Kernel]:
     """Declare a kernel each of whose threads makes one call of a function of the header.
 
     The decorated function has the kernel's arguments and no body. In the call they have their own names. The last one
     below ``# in`` is where a part of a launch begins, and says what a thread's number is: ``first_run`` makes it `run`.
+    A kernel for a single thread has no such argument.
 
     Parameters
     ----------
@@ -70,6 +71,8 @@ def kernel(call: str, *threads: str) -> Callable[[Callable[..., None]], wp.Kerne
         The call in C++, such as ``lfpiv::multiply(run, size, one.data, factor, other.data, product_out.data);``.
     *threads : str
         Names of the thread's numbers along the axes of a launch of several; one with "_" in front is not in the call.
+    registers : int
+        Most registers of a GPU that a thread may take; default: the compiler decides.
     """
 
     def declare(function: Callable[..., None]) -> wp.Kernel:
@@ -77,15 +80,18 @@ def kernel(call: str, *threads: str) -> Callable[[Callable[..., None]], wp.Kerne
         text = inspect.getsource(function)
         arguments = ast.parse(text).body[0].args.args  # type: ignore[attr-defined]
         first = [one.arg for one in arguments if not one.arg.endswith("_out")][-1]
-        axes = threads or (first.removeprefix("first_"),)
+        axes = threads or ((first.removeprefix("first_"),) if first.startswith("first_") else ())
         used = [one for one in axes if not one.startswith("_")]
-        given = [one for one in arguments if one.arg != first]
+        given = [one for one in arguments if not axes or one.arg != first]
         stub = ", ".join([f"{one}: int" for one in used] + [ast.unparse(one) for one in given])
-        passed = ", ".join([f"{first} + {used[0]}", *used[1:], *(one.arg for one in given)])
+        numbers = [f"{first} + {used[0]}", *used[1:]] if axes else []
+        passed = ", ".join([*numbers, *(one.arg for one in given)])
+        limit = f"(cuda_max_registers={registers})" if registers else ""
         source = (
             f"@wp.func_native({call!r})\ndef {name}_call({stub}): ...\n\n\n"
-            f"@wp.kernel\ndef {name}({', '.join(map(ast.unparse, arguments))}):\n"
-            f"    {', '.join(axes)} = wp.tid()\n    {name}_call({passed})\n"
+            f"@wp.kernel{limit}\ndef {name}({', '.join(map(ast.unparse, arguments))}):\n"
+            + (f"    {', '.join(axes)} = wp.tid()\n" if axes else "")
+            + f"    {name}_call({passed})\n"
         )
         place = f"<kernel {function.__module__}.{name}>"
         linecache.cache[place] = len(source), None, source.splitlines(keepends=True), place  # Warp reads its source

@@ -54,33 +54,6 @@ class PlacedRays:
     sets: int
 
 
-@wp.func_native("""
-    lfpiv::number_pixels(lfpiv::placed_rays(placed), number_out.data, pixel_out.data, first_out.data, count_out.data);
-""")
-def _number(
-    placed: PlacedRays,
-    number_out: wp.array(dtype=int),
-    pixel_out: wp.array(dtype=int),
-    first_out: wp.array(dtype=int),
-    count_out: wp.array(dtype=int),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::sort_rays(
-        lfpiv::placed_rays(placed), number.data, first_out.data, place_out.data, share_out.data, dark_out.data
-    );
-""")
-def _sort(
-    placed: PlacedRays,
-    number: wp.array(dtype=int),
-    first_out: wp.array(dtype=int),
-    place_out: wp.array(dtype=int),
-    share_out: wp.array(dtype=float),
-    dark_out: wp.array(dtype=int),
-): ...
-
-
 @native.kernel("lfpiv::collect(lfpiv::pixel_run(map, run), rays.data, image_out.data);")
 def _collect(
     # in
@@ -103,7 +76,9 @@ def _spread(
 ): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::number_pixels(lfpiv::placed_rays(placed), number_out.data, pixel_out.data, first_out.data, count_out.data);
+""")
 def _number_pixels(
     # in
     placed: PlacedRays,
@@ -112,11 +87,14 @@ def _number_pixels(
     pixel_out: wp.array(dtype=int),  # sensor pixel of each number
     first_out: wp.array(dtype=int),  # (sensor pixel + 2,): where the rays of each number begin
     count_out: wp.array(dtype=int),  # ends of the pixels of each set and of all; rays, dark places
-):
-    _number(placed, number_out, pixel_out, first_out, count_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::sort_rays(
+        lfpiv::placed_rays(placed), number.data, first_out.data, place_out.data, share_out.data, dark_out.data
+    );
+""")
 def _sort_rays(
     # in
     placed: PlacedRays,
@@ -126,8 +104,7 @@ def _sort_rays(
     place_out: wp.array(dtype=int),
     share_out: wp.array(dtype=float),
     dark_out: wp.array(dtype=int),
-):
-    _sort(placed, number, first_out, place_out, share_out, dark_out)
+): ...
 
 
 class Rays(Protocol):

@@ -59,33 +59,6 @@ class TiledMatrix:
     profiles: bool
 
 
-@wp.func_native("lfpiv::count_entries(matrix, level.data, {edge, side}, count_out.data, set_out.data);")
-def _count_entries_of(
-    matrix: TiledMatrix,
-    level: wp.array(dtype=wp.uint8),
-    edge: int,
-    side: int,
-    count_out: wp.array(dtype=wp.int64),
-    set_out: wp.array(dtype=wp.uint8),
-): ...
-
-
-@wp.func_native("""
-    lfpiv::write_entries(matrix, level.data, {edge, side}, next_out.data, voxel_out.data, start_out.data,
-                         place_out.data);
-""")
-def _write_entries_of(
-    matrix: TiledMatrix,
-    level: wp.array(dtype=wp.uint8),
-    edge: int,
-    side: int,
-    next_out: wp.array(dtype=wp.int64),
-    voxel_out: wp.array(dtype=int),
-    start_out: wp.array(dtype=int),
-    place_out: wp.array(dtype=int),
-): ...
-
-
 @native.kernel("lfpiv::gather_voxel(matrix, voxel, lenses, rays.data, active.data, volume_out.data);", "voxel", "_lane")
 def _gather(
     # in
@@ -134,7 +107,7 @@ def _align(
 ): ...
 
 
-@wp.kernel
+@native.kernel("lfpiv::count_entries(matrix, level.data, {edge, side}, count_out.data, set_out.data);")
 def _count_entries(
     # in
     matrix: TiledMatrix,
@@ -144,11 +117,13 @@ def _count_entries(
     # out
     count_out: wp.array(dtype=wp.int64),  # per tile
     set_out: wp.array(dtype=wp.uint8),
-):
-    _count_entries_of(matrix, level, edge, side, count_out, set_out)
+): ...
 
 
-@wp.kernel
+@native.kernel("""
+    lfpiv::write_entries(matrix, level.data, {edge, side}, next_out.data, voxel_out.data, start_out.data,
+                         place_out.data);
+""")
 def _write_entries(
     # in
     matrix: TiledMatrix,
@@ -160,8 +135,7 @@ def _write_entries(
     voxel_out: wp.array(dtype=int),
     start_out: wp.array(dtype=int),
     place_out: wp.array(dtype=int),
-):
-    _write_entries_of(matrix, level, edge, side, next_out, voxel_out, start_out, place_out)
+): ...
 
 
 class TiledProjector:
