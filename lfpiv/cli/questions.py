@@ -72,6 +72,16 @@ def _planes(text: str) -> tuple[float, ...]:
     return tuple(round(first + step * number, 9) for number in range(round(count) + 1))
 
 
+def _number(key: str, option: str, text: str) -> Question:
+    """Return a question for a number."""
+    return Question(key=key, option=option, form="a number", text=text, read=float)
+
+
+def _pattern(key: str, option: str, text: str, default: str) -> Question:
+    """Return a question for a pattern of paths."""
+    return Question(key=key, option=option, form="a path", text=text, default=default)
+
+
 QUESTIONS = (
     Question(key="name", option="--name", form="text", text="name of the experiment, title of its report"),
     Question(
@@ -81,40 +91,16 @@ QUESTIONS = (
         text="cameras and the angle of each about y [degree], positive on the side of +x, such as left=45, right=-45",
         read=_cameras,
     ),
-    Question(
-        key="focal_length_mm",
-        option="--focal-length",
-        form="a number",
-        text="focal length of the main lens [mm], engraved on it",
-        read=float,
+    _number("focal_length_mm", "--focal-length", "focal length of the main lens [mm], engraved on it"),
+    _number(
+        "magnification", "--magnification", "magnification: size on the sensor over size in the volume, of either sign"
     ),
-    Question(
-        key="magnification",
-        option="--magnification",
-        form="a number",
-        text="magnification: size on the sensor over size in the volume, of either sign",
-        read=float,
-    ),
-    Question(
-        key="f_number",
-        option="--f-number",
-        form="a number",
-        text="aperture of the main lens: the f-number set on its ring",
-        read=float,
-    ),
-    Question(
-        key="microlens_pitch_mm",
-        option="--microlens-pitch",
-        form="a number",
-        text="distance of the microlenses [mm], from the maker of the array",
-        read=float,
-    ),
-    Question(
-        key="microlens_focal_length_mm",
-        option="--microlens-focal-length",
-        form="a number",
-        text="focal length of the microlenses [mm], from the maker of the array",
-        read=float,
+    _number("f_number", "--f-number", "aperture of the main lens: the f-number set on its ring"),
+    _number("microlens_pitch_mm", "--microlens-pitch", "distance of the microlenses [mm], from the maker of the array"),
+    _number(
+        "microlens_focal_length_mm",
+        "--microlens-focal-length",
+        "focal length of the microlenses [mm], from the maker of the array",
     ),
     Question(
         key="microlens_layout",
@@ -123,13 +109,7 @@ QUESTIONS = (
         text="arrangement of the microlenses",
         default="square",
     ),
-    Question(
-        key="pixel_um",
-        option="--pixel",
-        form="a number",
-        text="pixel pitch of the sensor [um], from the data sheet of the camera",
-        read=float,
-    ),
+    _number("pixel_um", "--pixel", "pixel pitch of the sensor [um], from the data sheet of the camera"),
     Question(
         key="image_flip",
         option="--image-flip",
@@ -138,19 +118,12 @@ QUESTIONS = (
         "(none), or mirrored and upside down (both)",
         default="horizontal",
     ),
-    Question(
-        key="white_image",
-        option="--white",
-        form="a path",
-        text="white images, with {camera} for the name of the camera",
-        default="white/{camera}.tif",
-    ),
-    Question(
-        key="board_images",
-        option="--board",
-        form="a path",
-        text="images of the board, with {camera} and {plane}",
-        default="board/{camera}/plane_{plane:02d}.tif",
+    _pattern("white_image", "--white", "white images, with {camera} for the name of the camera", "white/{camera}.tif"),
+    _pattern(
+        "board_images",
+        "--board",
+        "images of the board, with {camera} and {plane}",
+        "board/{camera}/plane_{plane:02d}.tif",
     ),
     Question(
         key="dots",
@@ -159,20 +132,8 @@ QUESTIONS = (
         text="number of dots of the board along x and y, such as 7x7",
         read=_product(int),
     ),
-    Question(
-        key="spacing_mm",
-        option="--spacing",
-        form="a number",
-        text="distance of the dots [mm], from the drawing of the board",
-        read=float,
-    ),
-    Question(
-        key="dot_diameter_mm",
-        option="--dot-diameter",
-        form="a number",
-        text="diameter of a dot [mm], from the drawing of the board",
-        read=float,
-    ),
+    _number("spacing_mm", "--spacing", "distance of the dots [mm], from the drawing of the board"),
+    _number("dot_diameter_mm", "--dot-diameter", "diameter of a dot [mm], from the drawing of the board"),
     Question(
         key="planes_mm",
         option="--planes",
@@ -180,12 +141,11 @@ QUESTIONS = (
         text="depths of the planes of the board [mm], read on the stage, such as -2:2:0.5",
         read=_planes,
     ),
-    Question(
-        key="particle_images",
-        option="--images",
-        form="a path",
-        text="particle images, with {camera}, {pair} and {frame}, or {camera} and {instant} for a time series",
-        default="particles/{camera}/pair_{pair:04d}_{frame}.tif",
+    _pattern(
+        "particle_images",
+        "--images",
+        "particle images, with {camera}, {pair} and {frame}, or {camera} and {instant} for a time series",
+        "particles/{camera}/pair_{pair:04d}_{frame}.tif",
     ),
     Question(
         key="count",
@@ -201,20 +161,8 @@ QUESTIONS = (
         text="size of the volume [mm], which the light fills and all cameras see, such as 10x10x6",
         read=_product(float),
     ),
-    Question(
-        key="voxel_mm",
-        option="--voxel",
-        form="a number",
-        text="edge of a voxel [mm], about a microlens over the magnification",
-        read=float,
-    ),
-    Question(
-        key="dt_s",
-        option="--dt",
-        form="a number",
-        text="time between the two frames [s], from the timing of the laser, such as 1e-4",
-        read=float,
-    ),
+    _number("voxel_mm", "--voxel", "edge of a voxel [mm], about a microlens over the magnification"),
+    _number("dt_s", "--dt", "time between the two frames [s], from the timing of the laser, such as 1e-4"),
 )
 
 

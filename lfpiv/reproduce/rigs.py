@@ -241,7 +241,6 @@ def recorded_images(
     *,
     seed: list[int],
     frame: int,
-    cameras: Sequence[str] | None = None,
 ) -> dict[str, np.ndarray]:
     """Record particles with blur, noise and 12 bits: camera -> (rows, columns), float32 [count].
 
@@ -261,13 +260,9 @@ def recorded_images(
         Seed of the noise. The numbers of camera and frame are added to it.
     frame : int
         Number of the frame.
-    cameras : sequence of str, optional
-        Cameras that record; default: all.
     """
     images = {}
     for number, camera in enumerate(rig.scene.camera):
-        if cameras is not None and camera.name not in cameras:
-            continue
         eye = render_camera(camera, seed=[rig.scene.seed, 3, number])
         draw = np.random.default_rng([*seed, number, frame])
         image = render.render_sources(eye, positions_mm, counts * eye.microimage_px, size_mm, rays, rng=draw)
@@ -275,14 +270,7 @@ def recorded_images(
     return images
 
 
-def reconstruct_images(
-    weights: Weights,
-    images: Mapping[str, np.ndarray],
-    smart: Smart,
-    *,
-    floor: float | None = None,
-    first: np.ndarray | None = None,
-) -> xr.DataArray:
+def reconstruct_images(weights: Weights, images: Mapping[str, np.ndarray], smart: Smart) -> xr.DataArray:
     """Reconstruct a volume from raw images by SMART on the voxels of its weights.
 
     Parameters
@@ -293,16 +281,12 @@ def reconstruct_images(
         Camera name -> raw image, shape (rows, columns) [count]; other cameras are ignored.
     smart : Smart
         SMART's settings.
-    floor : float, optional
-        Noise floor of all images [count]. Default: measured in each image.
-    first : ndarray, shape (z, y, x), optional
-        First guess. Default: SMART's own.
     """
     light, noise = {}, {}
     for name, camera in weights.cameras.items():
         level, noise[name] = camera.decoder.background(images[name])
         light[name] = images[name] - np.float32(level)
-    return reconstruct(weights, light, floor=noise if floor is None else floor, first=first, **smart.of_one_frame())
+    return reconstruct(weights, light, floor=noise, **smart.of_one_frame())
 
 
 def truth(positions_mm: np.ndarray, grid: Grid) -> xr.DataArray:

@@ -106,8 +106,6 @@ class Normal:
     """Right-hand side, shape (particle, parameter)."""
     model: np.ndarray
     """Images of the particles [counts], shape (pixel,)."""
-    chi2: float
-    """Weighted sum of squares of the residuals."""
     light: np.ndarray
     """Light of the particles at which the equations hold [counts], shape (particle, camera)."""
 
@@ -143,8 +141,7 @@ def linearise(images: ParticleImages, scene: Scene, cloud: Cloud, scatter: float
         right[:, 3 + camera] += pairs.right[:, 3]
     matrix = sparse.bsr_array(matrix)
     matrix.sum_duplicates()
-    chi2 = float((np.square(residual, dtype=np.float64) / variance).sum())
-    return Normal(matrix=matrix, right=right, model=model, chi2=chi2, light=cloud.light)
+    return Normal(matrix=matrix, right=right, model=model, light=cloud.light)
 
 
 def rendered(images: ParticleImages, lists: list[ImageLists], light: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from lfpiv.calibration.board.planes import HELD_BYTES, Planes
 from lfpiv.calibration.board.pose import BIN_PITCHES
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import LensLattice, Optics
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 
 COUNTS_PER_PHOTON = 6.0
@@ -243,7 +244,7 @@ def measured(scene):
     white, images = Renderer(scene).images()
     decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, white)
     board = replace(scene.board, diameter_mm=scene.diameter_mm * scene.stated_diameter)
-    return measure_board(images, decoder, board, nominal_angle_deg=scene.nominal_angle_deg)
+    return measure_board(images, decoder, board, orientation=Orientation(scene.nominal_angle_deg))
 
 
 def label_errors(scene, dots):
@@ -313,7 +314,7 @@ def test_gaussian_fits_are_biased_to_lens_centres_and_the_integral_is_not():
     mean = {}
     for estimator in ("gaussian", "lens_integral"):
         dots = measure_board(
-            images, decoder, scene.board, nominal_angle_deg=scene.nominal_angle_deg, estimator=estimator
+            images, decoder, scene.board, orientation=Orientation(scene.nominal_angle_deg), estimator=estimator
         )
         assert np.array_equal(dots.found, scene.visible)
         mean[estimator] = np.hypot(*label_errors(scene, dots).T).mean()
@@ -539,16 +540,16 @@ def test_bad_boards_are_refused():
     decoder = LightFieldDecoder.from_white(scene.optics, scene.lattice, white)
     empty = [renderer.counts(np.zeros(scene.sensor_shape)) for _ in scene.planes_mm]
     with pytest.raises(InputError, match=r"expected a lattice of 5 x 5 dots, 0.8 mm apart"):
-        measure_board(empty, decoder, scene.board, nominal_angle_deg=20)
+        measure_board(empty, decoder, scene.board, orientation=Orientation(20))
     with pytest.raises(InputError, match="expected one per plane, 3, got 2"):
-        measure_board(empty[:2], decoder, scene.board, nominal_angle_deg=20)
+        measure_board(empty[:2], decoder, scene.board, orientation=Orientation(20))
     with pytest.raises(InputError, match=r"plane 1 of the board: expected an image of shape \(200, 200\)"):
-        measure_board([empty[0], np.zeros((3, 3)), empty[2]], decoder, scene.board, nominal_angle_deg=20)
+        measure_board([empty[0], np.zeros((3, 3)), empty[2]], decoder, scene.board, orientation=Orientation(20))
     holed = empty[1].astype(float)
     holed[5, 5] = np.nan
     with pytest.raises(InputError, match=r"plane 1 of the board: expected finite counts, got 1 pixels"):
-        measure_board([empty[0], holed, empty[2]], decoder, scene.board, nominal_angle_deg=20)
-    with pytest.raises(ValueError, match="nominal_angle_deg: expected a finite angle"):
-        measure_board(empty, decoder, scene.board, nominal_angle_deg=np.nan)
+        measure_board([empty[0], holed, empty[2]], decoder, scene.board, orientation=Orientation(20))
+    with pytest.raises(ValueError, match="orientation: expected the planned orientation"):
+        measure_board(empty, decoder, scene.board)
     with pytest.raises(ValueError, match="estimator: expected one of 'lens_integral', 'gaussian'"):
-        measure_board(empty, decoder, scene.board, nominal_angle_deg=20, estimator="centroid")
+        measure_board(empty, decoder, scene.board, orientation=Orientation(20), estimator="centroid")

@@ -50,16 +50,6 @@ def test_a_linear_flow_gives_its_own_matrix(seed):
     assert np.abs(strain.strain_rate_magnitude - np.sqrt(2 * np.sum(symmetric**2))).max() < ROUNDING
 
 
-def test_solid_rotation_has_twice_its_rate_as_vorticity_and_no_strain():
-    rate = np.array([1.0, -2.0, 3.0])  # rad/s about x, y, z
-    vectors = from_flow(lambda x, y, z: np.cross(rate, np.stack([x, y, z], -1)).transpose(3, 0, 1, 2))
-    curl = derived.vorticity(vectors)
-    for axis, value in zip("xyz", rate, strict=True):
-        assert np.abs(curl[f"vorticity_{axis}"] - 2 * value).max() < ROUNDING
-    assert np.abs(derived.q_criterion(vectors) - rate @ rate).max() < ROUNDING
-    assert np.abs(derived.strain_rate(vectors).strain_rate_magnitude).max() < ROUNDING
-
-
 def taylor_green(x, y, z):
     """Periodic vortices whose divergence is zero [m/s]."""
     return (

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -42,7 +41,6 @@ def measure_board(
     decoder: LightFieldDecoder,
     board: DotBoard,
     *,
-    nominal_angle_deg: float | None = None,
     orientation: Orientation | None = None,
     estimator: str = "lens_integral",
     dark: np.ndarray | None = None,
@@ -57,8 +55,6 @@ def measure_board(
         The camera's decoder.
     board : DotBoard
         The board and the depths of its planes.
-    nominal_angle_deg : float, optional
-        Planned camera angle alpha (Eqs. 1-3), correct to about 10 degrees [degree]. Alternative to `orientation`.
     orientation : Orientation, optional
         Planned orientation of the camera, correct to about 10 degrees. A board with a mark needs none.
     estimator : {"lens_integral", "gaussian"}
@@ -80,13 +76,8 @@ def measure_board(
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator: expected one of {', '.join(map(repr, ESTIMATORS))}, got {estimator!r}.")
-    stated = (nominal_angle_deg is not None) + (orientation is not None)
-    if stated > 1 or not (stated or board.mark):
-        raise ValueError("nominal_angle_deg, orientation: expected one of the two, or a board with a mark.")
-    if nominal_angle_deg is not None:
-        if not math.isfinite(nominal_angle_deg):
-            raise ValueError(f"nominal_angle_deg: expected a finite angle [degree], got {nominal_angle_deg}.")
-        orientation = Orientation(nominal_angle_deg)
+    if orientation is None and not board.mark:
+        raise ValueError("orientation: expected the planned orientation of the camera, or a board with a mark.")
     if len(images) != len(board.planes_mm):
         raise InputError(f"images: expected one per plane, {len(board.planes_mm)}, got {len(images)}.")
     signals = Signals.from_images(images, decoder, dark)
