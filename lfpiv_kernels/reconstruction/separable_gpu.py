@@ -45,15 +45,13 @@ class RayRows:
     count: int
 
 
-@native.kernel(
-    """
-    lfpiv::sum_down(
-        lfpiv::separable_arrays(separable), warp, volume.data, lfpiv::ray_rows(rows), lines_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+def _on_rows(function: str, light: str, *others: str) -> str:
+    """Return the call of a function that takes light through some ray rows."""
+    given = f"lfpiv::separable_arrays(separable), warp, {light}.data, lfpiv::ray_rows(rows)"
+    return f"lfpiv::{function}({given}, {', '.join(others)});"
+
+
+@native.kernel(_on_rows("sum_down", "volume", "lines_out.data"), "warp", "_lane")
 def _down(
     # in
     separable: Separable,
@@ -65,15 +63,7 @@ def _down(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::move_lines(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), back, lines_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("move_lines", "lines", "back", "lines_out.data"), "warp", "_lane")
 def _move(
     # in
     separable: Separable,
@@ -86,15 +76,7 @@ def _move(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::sum_across(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), bare_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("sum_across", "lines", "bare_out.data"), "warp", "_lane")
 def _across(
     # in
     separable: Separable,
@@ -106,15 +88,7 @@ def _across(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::add_rim(
-        lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), rays_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("add_rim", "bare", "rays_out.data"), "warp", "_lane")
 def _rim(
     # in
     separable: Separable,
@@ -126,15 +100,7 @@ def _rim(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::turn_back_rim(
-        lfpiv::separable_arrays(separable), warp, rays.data, lfpiv::ray_rows(rows), bare_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("turn_back_rim", "rays", "bare_out.data"), "warp", "_lane")
 def _rim_back(
     # in
     separable: Separable,
@@ -146,15 +112,7 @@ def _rim_back(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::return_across(
-        lfpiv::separable_arrays(separable), warp, bare.data, lfpiv::ray_rows(rows), lit, lines_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("return_across", "bare", "lit", "lines_out.data"), "warp", "_lane")
 def _across_back(
     # in
     separable: Separable,
@@ -167,15 +125,7 @@ def _across_back(
 ): ...
 
 
-@native.kernel(
-    """
-    lfpiv::return_down(
-        lfpiv::separable_arrays(separable), warp, lines.data, lfpiv::ray_rows(rows), lit, volume_out.data
-    );
-    """,
-    "warp",
-    "_lane",
-)
+@native.kernel(_on_rows("return_down", "lines", "lit", "volume_out.data"), "warp", "_lane")
 def _down_back(
     # in
     separable: Separable,

@@ -30,26 +30,6 @@ class Tiles:
     tiles: int
 
 
-@wp.func_native("""
-    lfpiv::pack_place(
-        lfpiv::block_arrays(blocks), lfpiv::tile_room(filled), lfpiv::block_arrays(packed_out), voxel, place,
-        lfpiv::BlockOrder(profiles, edge, lenses), even_blocks_out.data, even_values_out.data
-    );
-""")
-def _pack(
-    blocks: BlockArrays,
-    filled: Tiles,
-    voxel: int,
-    place: int,
-    profiles: bool,
-    edge: int,
-    lenses: int,
-    packed_out: BlockArrays,
-    even_blocks_out: wp.array(dtype=int),
-    even_values_out: wp.array(dtype=int),
-): ...
-
-
 @native.kernel(
     """
     lfpiv::measure_lens(
@@ -134,7 +114,17 @@ def _sum_tiles(
 ): ...
 
 
-@wp.kernel
+@native.kernel(
+    """
+    lfpiv::pack_place(
+        lfpiv::block_arrays(blocks), lfpiv::tile_room(filled), lfpiv::block_arrays(packed_out), voxel,
+        profiles ? place : place * lfpiv::HEIGHTS, lfpiv::BlockOrder(profiles, edge, lenses), even_blocks_out.data,
+        even_values_out.data
+    );
+    """,
+    "voxel",
+    "place",
+)
 def _pack_tiles(
     # in
     blocks: BlockArrays,
@@ -147,13 +137,7 @@ def _pack_tiles(
     packed_out: BlockArrays,  # without gaps, those of even lenses first
     even_blocks_out: wp.array(dtype=int),  # blocks and values of each voxel under even lenses
     even_values_out: wp.array(dtype=int),
-):
-    voxel, place = wp.tid()
-    if not profiles:
-        place = place * HEIGHTS
-    _pack(
-        blocks, filled, first_voxel + voxel, place, profiles, edge, lenses, packed_out, even_blocks_out, even_values_out
-    )
+): ...
 
 
 def fill(inputs: list[object], voxels: int, lenses: int, tiles: int, outputs: list[object]) -> Tiles:
