@@ -234,24 +234,12 @@ def _write_pixels(
     count_out[particle] = count
 
 
-@wp.func_native("""
-    for (int k = 0; k < count; ++k) {
-        pixel_out.data[first + k] = pixel.data[room + k];
-        values_out.data[first + k] = values.data[room + k];
+@native.kernel("""
+    for (int64_t from = room.data[particle], to = first.data[particle]; to < first.data[particle + 1]; ++from, ++to) {
+        pixel_out.data[to] = pixel.data[from];
+        values_out.data[to] = values.data[from];
     }
 """)
-def _copy(
-    count: int,
-    room: wp.int64,
-    pixel: wp.array(dtype=int),
-    values: wp.array(dtype=wp.vec4f),
-    first: wp.int64,
-    pixel_out: wp.array(dtype=int),
-    values_out: wp.array(dtype=wp.vec4f),
-): ...
-
-
-@wp.kernel
 def _close_gaps(
     # in
     room: wp.array(dtype=wp.int64),
@@ -262,10 +250,7 @@ def _close_gaps(
     # out
     pixel_out: wp.array(dtype=int),
     values_out: wp.array(dtype=wp.vec4f),
-):
-    particle = first_particle + wp.tid()
-    count = int(first[particle + 1] - first[particle])
-    _copy(count, room[particle], pixel, values, first[particle], pixel_out, values_out)
+): ...
 
 
 @dataclass(frozen=True, kw_only=True)
