@@ -31,7 +31,7 @@ import numpy as np
 from lfpiv.experiment.images import FLIPS
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.simulation.camera_images import StaticLight, board_truth, render_camera
-from lfpiv.simulation.particles import LitParticles
+from lfpiv.simulation.particles import LitParticles, PlacedParticles
 from lfpiv.simulation.scene import Scene
 from lfpiv.simulation.sensor import SensorPattern
 from lfpiv.simulation.series import SeriesInstant
@@ -75,44 +75,23 @@ def particle_arrays(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]
         Arrays by their names.
     """
     arrays: dict[str, Any] = {}
-    for number, one in enumerate(placed):
-        if isinstance(one, SeriesInstant):
-            arrays |= _instant_arrays(scene, scene.particles.first + number, one)
+    for number, light in enumerate(placed):
+        own: dict[str, Any] = {}
+        if isinstance(light, SeriesInstant):
+            name = f"instant_{scene.particles.first + number:06d}"
+            particles: SeriesInstant | PlacedParticles = light
+            own["index"] = light.index
         else:
-            arrays |= _pair_arrays(scene, number, one)
-    return arrays
-
-
-def _instant_arrays(scene: Scene, number: int, instant: SeriesInstant) -> dict[str, Any]:
-    """Return the arrays of one instant of a series."""
-    arrays: dict[str, Any] = {
-        "index": instant.index,
-        "positions_mm": instant.position_mm,
-        "intensity": instant.intensity,
-    }
-    if instant.displacement_mm is not None:
-        arrays["displacement_mm"] = instant.displacement_mm
-        arrays["velocity_m_s"] = instant.displacement_mm / scene.dt_s / 1000
-    if scene.brightness is not None:
-        arrays["diameter"] = instant.diameter
-    if scene.brightness is not None or scene.sheet is not None:
-        arrays |= {"brightness": instant.brightness, "power": instant.power}
-    return {f"instant_{number:06d}_{name}": value for name, value in arrays.items()}
-
-
-def _pair_arrays(scene: Scene, pair: int, lit: LitParticles) -> dict[str, Any]:
-    """Return the arrays of one pair."""
-    placed, power, brightness = lit
-    arrays: dict[str, Any] = {}
-    arrays[f"pair_{pair:04d}_positions_mm"] = placed.position_mm
-    arrays[f"pair_{pair:04d}_displacement_mm"] = placed.displacement_mm
-    arrays[f"pair_{pair:04d}_velocity_m_s"] = placed.displacement_mm / scene.dt_s / 1000
-    arrays[f"pair_{pair:04d}_intensity"] = placed.intensity
-    if scene.brightness is not None:
-        arrays[f"pair_{pair:04d}_diameter"] = placed.diameter
-    if scene.brightness is not None or scene.sheet is not None:
-        arrays[f"pair_{pair:04d}_brightness"] = brightness
-        arrays[f"pair_{pair:04d}_power"] = power
+            name, particles = f"pair_{number:04d}", light.placed
+        own |= {"positions_mm": particles.position_mm, "intensity": particles.intensity}
+        if particles.displacement_mm is not None:
+            own["displacement_mm"] = particles.displacement_mm
+            own["velocity_m_s"] = particles.displacement_mm / scene.dt_s / 1000
+        if scene.brightness is not None:
+            own["diameter"] = particles.diameter
+        if scene.brightness is not None or scene.sheet is not None:
+            own |= {"brightness": light.brightness, "power": light.power}
+        arrays |= {f"{name}_{key}": value for key, value in own.items()}
     return arrays
 
 
