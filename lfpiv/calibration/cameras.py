@@ -26,6 +26,7 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
+from lfpiv.calibration.committee import MOST_NETWORKS, NETWORKS, nearest_to_others
 from lfpiv.calibration.liquid import median_distance
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
@@ -162,6 +163,8 @@ class _Mapping:
     """The network and its errors."""
     agreeing: np.ndarray
     """Labels used, shape (n,), bool."""
+    scatter: float
+    """Error that the chance of the training makes [microlens pitch]."""
     sigma_nor_stated: float
     """Mean error on the held-out dots at their stated places [microlens pitch]."""
 
@@ -257,21 +260,36 @@ def _fit_mapping(
     baseline = lens if settings.baseline == "thin_lens" else None
     points, pupil, std = dots.points_mm[agreeing], dots.pupil_mm[agreeing], std[agreeing]
     target = (dots.array_mm if baseline is None else residual)[agreeing]
-    with input_errors(place):
-        training = train(
+
+    def trained(seed: int) -> Training:
+        return train(
             np.hstack([points, pupil]),
             target,
             TrainingSettings(
                 hidden=tuple(settings.hidden),
                 epochs=settings.epochs,
                 shrink=baseline is not None,
-                seed=settings.seed,
+                seed=seed,
             ),
             groups=dots.dot[agreeing],
             std=std,
-            virtual_samples=sampler_between_dots(points, pupil, target, std, pitch_mm=pitch_mm, seed=settings.seed),
+            virtual_samples=sampler_between_dots(points, pupil, target, std, pitch_mm=pitch_mm, seed=seed),
             unit=pitch_mm,
         )
+
+    region_mm, trainings = np.stack([points.min(0), points.max(0)]), list[Training]()
+    for number in range(MOST_NETWORKS):
+        with input_errors(place):
+            trainings.append(trained(settings.seed + number))
+        if len(trainings) >= NETWORKS:
+            chosen = nearest_to_others(trainings, region_mm, setup.optics.pupil_radius_mm, settings.seed)
+            if chosen.scatter < chosen.training.sigma_nor * pitch_mm:
+                break
+    training = replace(chosen.training, seconds=sum(one.seconds for one in trainings))
+    log.debug(
+        "camera %s: network %d of %d; networks scatter by %.2g pitch", setup.name,
+        trainings.index(chosen.training) + 1, len(trainings), chosen.scatter / pitch_mm,
+    )  # fmt: skip
     held_out = training.split.test
     inputs = stated_mm[agreeing][held_out], pupil[held_out]
     mapped = training.network(np.hstack(inputs)) + (0.0 if baseline is None else baseline(*inputs))
@@ -280,6 +298,7 @@ def _fit_mapping(
         baseline=baseline,
         training=training,
         agreeing=agreeing,
+        scatter=chosen.scatter / pitch_mm,
         sigma_nor_stated=float(stated.mean()),
     )
 
@@ -296,7 +315,9 @@ def _quality(
         **vars(sensor.quality),
         turn_from_nominal_deg=nominal.turn_deg,
         magnification=nominal.magnification,
-        sigma_nor_test=math.hypot(training.sigma_nor, mean_size(dots.left_over_mm) / sensor.lattice.pitch_mm),
+        sigma_nor_test=math.hypot(
+            max(training.sigma_nor, mapping.scatter), mean_size(dots.left_over_mm) / sensor.lattice.pitch_mm
+        ),
         sigma_nor_stated=mapping.sigma_nor_stated,
         dots_found=int(dots.found.sum()),
         dots_expected=int(dots.expected.sum()),

@@ -52,7 +52,8 @@ class CalibrationQuality(LensArrayQuality):
     magnification: float
     """Magnification at the middle of the board."""
     sigma_nor_test: float
-    """Mean error of the mapping on held-out dots, Eq. 8 [microlens pitch]. Errors of the board are corrected."""
+    """Mean error of the mapping on held-out dots, Eq. 8, at least the scatter of networks trained alike [microlens
+    pitch]. Errors of the board are corrected."""
     sigma_nor_stated: float = math.nan
     """The same with the dots where they are stated to be: errors of the mapping and of the board together. Equal to
     `sigma_nor_test` where nothing is corrected."""

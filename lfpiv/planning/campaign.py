@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from lfpiv.errors import InputError
@@ -26,10 +27,11 @@ from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import FrameVolume, PairVolumes
 from lfpiv.runs import belonging, device_memory, memory, rig, worker_plan
 from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
+from lfpiv.runs.pair import PairWork
 from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.run import Run, open_run
 from lfpiv.velocity import vector_grid
-from lfpiv.warn import collected
+from lfpiv.warn import Warning, collected
 from lfpiv.weights.checks import compare_with_count
 from lfpiv.weights.memory_left import rays_bytes
 from lfpiv_kernels import runtime
@@ -142,7 +144,7 @@ def _plan(run: Run, pairs: int, workers: int, scratch: Path, stored: bool) -> Pl
     )
     pair = sum(first.steps.values(), Cost())
     simulated = experiment.simulated_of(pairs)
-    again = pair * (simulated + 1 if simulated else 0)
+    again = (pair - first.steps.get("tracking", Cost())) * (simulated + 1 if simulated else 0)
     total = sum(first.prepared.values(), Cost()) + first.once + pair * math.ceil(pairs / workers) + again
     step(1.0)
     return Plan(
@@ -181,9 +183,10 @@ class _FirstPair:
     once: Cost
     """What only the first pair needs: loaded kernels, sums of subsets, the estimator of the particles' size."""
     steps: Mapping[str, Cost]
-    """Costs of a further pair: "images", "reconstruction", "correlation", "writing"."""
+    """Costs of a further pair: "images", "reconstruction", "correlation", "tracking" if particles are, "writing"."""
     weights_bytes: int
     file_bytes: int
+    """Vectors and linked particles of a pair."""
 
 
 def _timed(work: Callable[[], Result]) -> tuple[Result, Cost]:
@@ -220,16 +223,34 @@ def _first_pair(
     (_, first), (volumes, solved) = _timed(solve), _timed(solve)
     both = PairVolumes(frames=volumes, names=experiment.frames)
     (_, loaded), (vectors, correlated) = (_timed(lambda: work.vectors_between(number, both)) for _ in range(2))
-    file = work.files(number)
-    _, written = _timed(lambda: work.result(file, vectors, both)[1]())
     images = (reading or Cost()) * experiment.recording.lasers
+    steps = {"images": images, "reconstruction": solved, "correlation": correlated}
+    once, file = (first - solved) + (loaded - correlated), work.files(number)
+    if file.particles is not None:
+        (vectors, table, _), steps["tracking"] = _tracked(work, number, light, both, correlated)
+        file.write_particles(table)
+    _, steps["writing"] = _timed(lambda: work.result(file, vectors, both)[1]())
+    paths = [path for path in (file.vectors, file.particles) if path is not None]
     return _FirstPair(
         prepared=prepared,
-        once=(first - solved) + (loaded - correlated),
-        steps={"images": images, "reconstruction": solved, "correlation": correlated, "writing": written},
+        once=once,
+        steps=steps,
         weights_bytes=weights.memory_bytes,
-        file_bytes=file.vectors.stat().st_size,
+        file_bytes=sum(path.stat().st_size for path in paths),
     )
+
+
+def _tracked(
+    work: PairWork, pair: int, light: tuple[FrameLight, FrameLight], volumes: PairVolumes, correlated: Cost
+) -> tuple[tuple[xr.Dataset, xr.Dataset, list[Warning]], Cost]:
+    """Track the particles of a pair; return the results and the cost beside the correlation.
+
+    In a series the particles of its first frame are known.
+    """
+    first, _ = work.fits.of(work.search, light, volumes)
+    work.fits.last = (light[0].frame, first) if work.experiment.recording.is_series else None
+    found, cost = _timed(lambda: work.tracked(pair, light, volumes))
+    return found, cost - correlated
 
 
 def _light(experiment: Experiment, weights: Weights) -> tuple[tuple[FrameLight, FrameLight], Cost | None]:
@@ -293,8 +314,8 @@ def _with_voxels(run: Run, assumptions: list[str]) -> Run:
         assumptions.append("no light lies beyond the volume: one guard layer on each side")
     if run.guard is None:
         assumptions.append("the search of all images for background, guard layers and particle size is not in the plan")
-    if experiment.tracking is not None:
-        assumptions.append("the time of tracking is not in the plan")
+    if experiment.tracking is not None and experiment.recording.is_series:
+        assumptions.append("links over the whole series are not in the plan")
     if experiment.in_sequence:
         assumptions.append("each instant is reconstructed by itself: the time of smart.predict differs")
     if experiment.self_calibration.pairs:

@@ -45,7 +45,7 @@ class Time:
     pair: Cost
     """One pair in one worker."""
     steps: Mapping[str, Cost]
-    """Of a pair: "images", "reconstruction", "correlation", "writing"."""
+    """Of a pair: "images", "reconstruction", "correlation", "tracking" where particles are tracked, "writing"."""
     simulated: Cost
     """Pairs that are simulated at the end to measure the damping by ghosts."""
     total_s: float
@@ -75,9 +75,9 @@ class Disk:
     """Files of a campaign [byte]."""
 
     pair: int
-    """Vectors of a pair."""
+    """Vectors and linked particles of a pair."""
     results: int
-    """Vectors of all pairs."""
+    """Vectors and linked particles of all pairs."""
     volumes: int
     """Both volumes of a pair, if they are kept, before compression."""
     weights: int

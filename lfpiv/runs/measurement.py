@@ -105,7 +105,8 @@ class Rig(Shown):
         step(RECONSTRUCTED)
         with threadpool_limits(1):  # as in a run, whose numbers do not depend on the threads of BLAS
             if self.experiment.by_links:
-                vectors, _, _ = self.work.tracked(self.work.files(pair), volumes)
+                light = [self.work.light_again(frame) for frame in self.experiment.pair_frames(pair)]
+                vectors, _, _ = self.work.tracked(pair, light, volumes)
             else:
                 vectors = self.work.vectors_between(pair, volumes)
         step(CORRELATED)

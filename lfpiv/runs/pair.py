@@ -25,6 +25,7 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import PairFiles, PairVolumes
 from lfpiv.runs import belonging, pair_figures
+from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.frame_work import FrameWork
 from lfpiv.runs.frames import Frames, JointFrames, failure
 from lfpiv.runs.pair_figures import PairFigures
@@ -168,19 +169,15 @@ class PairWork(FrameWork):
         vectors.attrs["correlation_s"] = time.perf_counter() - start
         return vectors
 
-    def tracked(self, files: PairFiles, volumes: PairVolumes) -> tuple[xr.Dataset, xr.Dataset, list[Warning]]:
+    def tracked(
+        self, pair: int, light: Sequence[FrameLight], volumes: PairVolumes
+    ) -> tuple[xr.Dataset, xr.Dataset, list[Warning]]:
         """Return the vectors of a pair, its linked particles, and the warnings about these.
 
         Where links resolve the flow better, vectors are means of the flow through them.
-
-        Raises
-        ------
-        InputError
-            If an image cannot be read again.
         """
-        vectors = self.vectors_between(files.pair, volumes)
+        vectors = self.vectors_between(pair, volumes)
         start = time.perf_counter()
-        light = [self.light_again(file.frame) for file in files.frames]
         table, found = track(self.search, self.fits, light, volumes, vectors)
         if vectors.attrs["verdict"] in REFUSED:
             table = refused(table)
@@ -212,7 +209,8 @@ class PairWork(FrameWork):
         if files.particles is None or self.weights is None:
             vectors, found = self.vectors_between(files.pair, volumes), list[Warning]()
         else:
-            vectors, table, found = self.tracked(files, volumes)
+            light = [self.light_again(file.frame) for file in files.frames]
+            vectors, table, found = self.tracked(files.pair, light, volumes)
             self._keep_particles(files, table, found)
         figures, write_vectors = self.result(files, vectors, volumes, found)
         self.log_warnings(files.pair, volumes.between)

@@ -6,6 +6,7 @@ the point (s, t) on the microlens array [mm], and those of the voxel's projected
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -50,25 +51,29 @@ def fit_rays(camera: CalibratedCamera, points_mm: np.ndarray, *, degree: int) ->
     ndarray, shape (point, 2, 6 or 10), float32
         Coefficients of s and t [mm] in the pupil point [mm], terms as in `POWERS`.
     """
-    radius = camera.optics.pupil_radius_mm
-    unit = np.array([(r * np.cos(a), r * np.sin(a)) for r, n in RINGS for a in 2 * np.pi * (np.arange(n) + 0.25) / n])
-    powers = [power for power in POWERS if sum(power) <= degree]
-    terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
-    solve = np.linalg.pinv(terms) / np.array([radius ** (a + b) for a, b in powers])[:, None]
-    pupil = (unit * radius).astype(np.float32)
-    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one matrix product for s and t
-    both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
-    product = both.reshape(2 * len(unit), -1)
-    out = np.empty((len(points_mm), 2, len(powers)), np.float32)
+    pupil, product = _fan(camera.optics.pupil_radius_mm, degree)
+    out = np.empty((len(points_mm), 2, product.shape[1] // 2), np.float32)
     for first in range(0, len(points_mm), CHUNK_POINTS):
         part = points_mm[first : first + CHUNK_POINTS]
         rays = camera.map_fan(part, pupil).reshape(len(part), -1)  # s and t alternate
         middle = rays[:, :2].copy()
         for axis in range(2):  # fit differences: float32 loses digits in large values
             rays[:, axis::2] -= middle[:, axis, None]
-        out[first : first + len(part)] = (rays @ product).reshape(-1, 2, len(powers))
+        out[first : first + len(part)] = (rays @ product).reshape(-1, *out.shape[1:])
         out[first : first + len(part), :, 0] += middle
     return out
+
+
+@functools.cache
+def _fan(radius_mm: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pupil points of a fit [mm], and the matrix from their s and t in turns to the coefficients."""
+    unit = np.array([(r * np.cos(a), r * np.sin(a)) for r, n in RINGS for a in 2 * np.pi * (np.arange(n) + 0.25) / n])
+    powers = [power for power in POWERS if sum(power) <= degree]
+    terms = np.stack([unit[:, 0] ** a * unit[:, 1] ** b for a, b in powers], axis=1)
+    solve = np.linalg.pinv(terms) / np.array([radius_mm ** (a + b) for a, b in powers])[:, None]
+    both = np.zeros((len(unit), 2, 2, len(powers)), np.float32)  # one matrix product for s and t
+    both[:, 0, 0], both[:, 1, 1] = solve.T, solve.T
+    return (unit * radius_mm).astype(np.float32), both.reshape(2 * len(unit), -1)
 
 
 def degree_of(camera: CalibratedCamera, points_mm: np.ndarray, form: str) -> int:
@@ -102,14 +107,14 @@ def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float
     ndarray, shape (voxel, 38), float32
     """
     degree = degree_of(camera, centres_mm, form)
-    fits = fit_rays(camera, centres_mm, degree=degree)
+    faces = np.concatenate([np.zeros((1, 3)), -np.eye(3), np.eye(3)])[:, None] * voxel_mm / 2
+    points = (centres_mm + faces).reshape(-1, 3)
+    fits = fit_rays(camera, points, degree=degree)
+    fits = fits.reshape(len(faces), len(centres_mm), *fits.shape[1:])
     model = np.zeros((len(centres_mm), MODEL_SIZE), np.float32)
-    _set_rays(model, fits)
+    _set_rays(model, fits[0])
     for axis in range(3):
-        face = np.zeros(3)
-        face[axis] = voxel_mm / 2
-        before, behind = (fit_rays(camera, centres_mm + sign * face, degree=degree) for sign in (-1, 1))
-        edge = behind - before
+        edge = fits[4 + axis] - fits[1 + axis]
         model[:, 12 + 2 * axis : 14 + 2 * axis] = edge[:, :, 0]
         model[:, 18 + 4 * axis : 22 + 4 * axis] = edge[:, :, 1:3].reshape(-1, 4)
     return _finite(model)

@@ -18,13 +18,14 @@ from lfpiv.report.summary import DeviceFigures
 from lfpiv.results import netcdf
 from lfpiv.runs import device_memory, memory
 from lfpiv.runs.memory import GIB
-from lfpiv.settings.processing import Bootstrap
+from lfpiv.settings.processing import Bootstrap, Tracking
 from lfpiv.weights.memory_left import rays_bytes
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import Device
 
 COMPRESSION = 0.15
 """Relative error of a file's size: simulated vectors and volumes are compressed like recorded ones, not to the byte."""
+FEW_PARTICLES = 4096  # bytes, the least of a file of linked particles
 PAIRS, WORKERS = 1000, 2
 
 
@@ -74,6 +75,15 @@ def test_two_workers_share_pairs_and_threads(planned):
     assert set(time.preparation) == {"weights", "cameras"}
     card = planned.card().text()
     assert f"{math.prod(planned.vectors):,} per pair" in card and "1,000 pairs with 2 workers" in card
+
+
+def test_tracking_is_a_step_of_the_pair(planned, small_run):
+    experiment = dataclasses.replace(read_experiment(small_run.experiment), tracking=Tracking(vectors="links"))
+    tracked = lfpiv.plan(experiment, pairs=PAIRS, out=small_run.out)
+    assert list(tracked.time.steps) == ["images", "reconstruction", "correlation", "tracking", "writing"]
+    assert tracked.time.steps["tracking"].cpu_s > 0
+    assert tracked.disk.pair > planned.disk.pair + FEW_PARTICLES
+    assert not [text for text in tracked.assumptions if "tracking" in text]
 
 
 @pytest.mark.slow

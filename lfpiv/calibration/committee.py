@@ -1,0 +1,61 @@
+"""Choose one of several networks that differ by the chance of their training only.
+
+A network whose first weights or split were unlucky can leave the true mapping between the dots or at the border of the
+board, where no held-out dot shows it. Such errors differ from network to network. So the network nearest to the others
+is taken, and the distance to them states the error of a network by itself [1]_.
+
+References
+----------
+.. [1] L. K. Hansen, P. Salamon, "Neural network ensembles", IEEE Trans. Pattern Anal. Mach. Intell. 12 (1990) 993-1001,
+   doi:10.1109/34.58871.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv.calibration.training import Training
+from lfpiv.geometry.optics import random_on_pupil
+
+NETWORKS, MOST_NETWORKS = 3, 7
+"""Networks of a camera: the least number of which the one nearest to the others can be told, and the largest one, where
+networks scatter by more than the held-out dots show."""
+RAYS = 2000
+"""Rays on which networks are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chosen:
+    """The network nearest to the others."""
+
+    training: Training
+    scatter: float
+    """Mean distance to the other networks over the square root of 2, in units of the networks' outputs: the error that
+    the chance of the training makes, where all networks have it alike."""
+
+
+def nearest_to_others(
+    trainings: Sequence[Training], region_mm: np.ndarray, pupil_radius_mm: float, seed: int
+) -> Chosen:
+    """Choose the network with the least mean distance to the others, over rays of a box through the whole pupil.
+
+    Parameters
+    ----------
+    trainings : sequence of Training
+        Networks of object point and pupil point (x, y, z, u, v) [mm], two or more.
+    region_mm : ndarray, shape (2, 3)
+        Lowest and highest corner of the box [mm].
+    pupil_radius_mm : float
+        Radius of the pupil [mm].
+    seed : int
+        Seed of the rays.
+    """
+    rng, (low, high) = np.random.default_rng(seed), region_mm
+    rays = np.hstack([rng.uniform(low, high, (RAYS, 3)), random_on_pupil(pupil_radius_mm, RAYS, rng)])
+    places = np.stack([one.network(rays) for one in trainings])
+    distances = np.linalg.norm(places[:, None] - places, axis=-1).mean(-1).sum(1) / (len(trainings) - 1)
+    best = int(distances.argmin())
+    return Chosen(training=trainings[best], scatter=float(distances[best] / np.sqrt(2)))

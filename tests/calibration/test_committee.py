@@ -1,0 +1,52 @@
+"""Networks that differ by chance only: the one nearest to the others is taken, and their scatter is stated."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lfpiv.calibration.committee import nearest_to_others
+from lfpiv.calibration.training import TrainingSettings, train
+from lfpiv.geometry.optics import random_on_pupil
+
+REGION_MM, PUPIL_MM = np.array([[-2.0, -2, -1], [2, 2, 1]]), 12.5
+BORDER_MM = 0.3  # error of a network at one border, where no sample shows it
+SHIFT_MM = 0.004  # of a network, along one output, against two equal ones
+
+
+def places(points):
+    x, y, z, u, v = points.T
+    return np.stack([x + 0.05 * z * u + 0.01 * x * z, y + 0.05 * z * v], axis=1)
+
+
+@pytest.fixture(scope="module")
+def trainings():
+    rng = np.random.default_rng(5)
+    rays = np.hstack([rng.uniform(*REGION_MM, (1500, 3)), random_on_pupil(PUPIL_MM, 1500, rng)])
+    return [train(rays, places(rays), TrainingSettings(hidden=(10,), epochs=30, seed=seed)) for seed in range(3)]
+
+
+def shifted(training, by_mm):
+    network = training.network
+    return dataclasses.replace(
+        training, network=dataclasses.replace(network, output_centre=network.output_centre + by_mm)
+    )
+
+
+def test_an_outlier_is_never_taken(trainings):
+    wrong = shifted(trainings[0], BORDER_MM)
+    for at in range(3):
+        some = [*trainings[1:]]
+        some.insert(at, wrong)
+        assert nearest_to_others(some, REGION_MM, PUPIL_MM, seed=0).training is not wrong
+
+
+def test_the_scatter_is_the_error_of_a_network(trainings):
+    one = trainings[0]
+    chosen = nearest_to_others([one, shifted(one, [SHIFT_MM, 0])], REGION_MM, PUPIL_MM, seed=0)
+    assert chosen.scatter == pytest.approx(SHIFT_MM / np.sqrt(2), rel=1e-9)
+    rng = np.random.default_rng(7)
+    rays = np.hstack([rng.uniform(*REGION_MM, (4000, 3)), random_on_pupil(PUPIL_MM, 4000, rng)])
+    errors = [np.linalg.norm(one.network(rays) - places(rays), axis=1).mean() for one in trainings]
+    found = nearest_to_others(trainings, REGION_MM, PUPIL_MM, seed=0).scatter
+    assert min(errors) / 2 < found < 2 * max(errors)  # three networks tell a mean error within a factor of two
