@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lfpiv.progress import Progress
-from lfpiv.reproduce.rigs import OPTICS, VOXEL_MM, Rig, calibrated_rig
+from lfpiv.reproduce.rigs import VOXEL_MM, Rig, calibrated_rig, table2_scene
 from lfpiv.simulation.scene import Scene
 
 SENSOR_PX = {"small": (1728, 2208), "paper": (2208, 2752)}
@@ -42,32 +42,20 @@ def experimental_scene(scale: str, seed: int) -> Scene:
     0.5 mm apart is recorded at every millimetre from -6 to 6 mm.
     """
     rows, columns = SENSOR_PX[scale]
-    cameras = [
-        {
-            "name": f"camera{number + 1}",
-            **OPTICS,
-            "pixel_um": 4.54,
-            "sensor_width_px": columns,
-            "sensor_height_px": rows,
-            "nominal_angle_deg": angle,
-            "vignetting": 0.1,
-            "lens_gain_sd": 0.01,
-            **misalignment,
-        }
-        for number, (angle, misalignment) in enumerate(zip((20.0, -20.0), MISALIGNMENTS, strict=True))
-    ]
-    return Scene.model_validate(
-        {
-            "name": "table 2, experiment",
-            "seed": seed,
-            "dt_s": 1.0,
-            "camera": cameras,
-            "board": {"dots": (7, 7), "spacing_mm": 0.5, "dot_diameter_mm": 0.1, "planes_mm": PLANES_MM},
-            # required by the scene, not used: each case renders its own particles
-            "volume": {"size_mm": (3.0, 3.0, 12.0), "voxel_mm": VOXEL_MM},
-            "particles": {"count": 8},
-            "flow": {"kind": "uniform", "displacement_mm": (0.0, 0.0, 0.0)},
-        }
+    sensor = {"pixel_um": 4.54, "sensor_width_px": columns, "sensor_height_px": rows}
+    faults = {"vignetting": 0.1, "lens_gain_sd": 0.01}
+    cameras = (
+        {**sensor, "nominal_angle_deg": angle, **faults, **misalignment}
+        for angle, misalignment in zip((20.0, -20.0), MISALIGNMENTS, strict=True)
+    )
+    return table2_scene(
+        "table 2, experiment",
+        seed,
+        cameras,
+        board={"dots": (7, 7), "spacing_mm": 0.5, "planes_mm": PLANES_MM},
+        dt_s=1.0,
+        volume={"size_mm": (3.0, 3.0, 12.0), "voxel_mm": VOXEL_MM},
+        particles={"count": 8},
     )
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -142,33 +143,25 @@ def numerical_scene(scale: str, seed: int) -> Scene:
     The images are rounded to 12 bits and have no other noise, as in the paper. "small" has the same optics on a smaller
     sensor and fewer planes of the board.
     """
-    cameras = [
-        {
-            "name": f"camera{number + 1}",
-            **OPTICS,
-            "sensor_width_px": SENSOR_PX[scale],
-            "sensor_height_px": SENSOR_PX[scale],
-            "nominal_angle_deg": angle,
-        }
-        for number, angle in enumerate(ANGLES_DEG)
-    ]
-    return Scene.model_validate(
-        {
-            "name": "table 2, numerical",
-            "seed": seed,
-            "dt_s": DT_S,
-            "camera": cameras,
-            "board": {
-                "dots": DOTS,
-                "spacing_mm": 1.0,
-                "dot_diameter_mm": 0.1,
-                "planes_mm": tuple(float(z) for z in DEPTHS_MM[scale]),
-            },
-            **UNUSED_TABLES,
-            "quality": {"pixel_rays": WHITE_RAYS},
-            "noise": {"background": 0.0, "read_noise": 0.0, "full_well_e": 0.0},
-        }
+    edge = SENSOR_PX[scale]
+    sensor = {"sensor_width_px": edge, "sensor_height_px": edge}
+    return table2_scene(
+        "table 2, numerical",
+        seed,
+        ({**sensor, "nominal_angle_deg": angle} for angle in ANGLES_DEG),
+        board={"dots": DOTS, "spacing_mm": 1.0, "planes_mm": tuple(map(float, DEPTHS_MM[scale]))},
+        quality={"pixel_rays": WHITE_RAYS},
+        noise={"background": 0.0, "read_noise": 0.0, "full_well_e": 0.0},
     )
+
+
+def table2_scene(
+    name: str, seed: int, cameras: Iterable[Mapping[str, Any]], *, board: Mapping[str, Any], **tables: Any
+) -> Scene:
+    """Return a scene of numbered cameras with the optics of Table 2, unless they state others, and dots of 0.1 mm."""
+    numbered = [{"name": f"camera{number}", **OPTICS, **camera} for number, camera in enumerate(cameras, 1)]
+    known = {"name": name, "seed": seed, "dt_s": DT_S, "camera": numbered, "board": {"dot_diameter_mm": 0.1, **board}}
+    return Scene.model_validate(known | UNUSED_TABLES | tables)
 
 
 def numerical_rig(folder: Path, scale: str, seed: int, progress: Progress) -> Rig:
