@@ -21,13 +21,13 @@ from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
-from lfpiv.geometry.grid import NO_LAYERS, Grid, Layers
+from lfpiv.geometry.grid import Grid
 from lfpiv.records import read_json, validate
 from lfpiv.results import datasets, netcdf, provenance
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.particles import write_particles
 from lfpiv.results.provenance import Marks, Stamp
-from lfpiv.results.stamps import of_pair
+from lfpiv.results.stamps import Inputs, of_pair
 from lfpiv.warn import Warning
 
 
@@ -148,24 +148,9 @@ class PairFiles:
     particles_stamp: Stamp | None = None
 
     @classmethod
-    def of(
-        cls,
-        experiment: Experiment,
-        calibration: str,
-        folder: Folder,
-        pair: int,
-        *,
-        background: str | None = None,
-        guard: Layers = NO_LAYERS,
-        refinement: float = 1.0,
-    ) -> PairFiles:
-        """Return the files of a pair.
-
-        `calibration` and `background` are the hashes of the calibration's stamp and of the subtracted light. `guard`
-        has the guard layers of the volumes, `refinement` is the edge of their voxels over the edge of reconstructed
-        voxels.
-        """
-        stamps = of_pair(experiment, calibration, pair, background=background, guard=guard, refinement=refinement)
+    def of(cls, experiment: Experiment, inputs: Inputs, folder: Folder, pair: int) -> PairFiles:
+        """Return the files of a pair."""
+        stamps = of_pair(experiment, inputs, pair)
         frames = experiment.pair_frames(pair)
         first, second = (
             VolumeFile(

@@ -24,6 +24,20 @@ from lfpiv.results.provenance import IMAGES_BESIDE, MASK_FILES, OF_PAIR, Stamp
 from lfpiv.version import __version__
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What volumes depend on beside settings and images."""
+
+    calibration: str
+    """Hash of the stamp of the calibration."""
+    background: str | None = None
+    """Hash of the light that is subtracted from the images; None if there is none."""
+    guard: Layers = NO_LAYERS
+    """Layers of voxels beyond the grid of the experiment that are reconstructed, and cut away afterwards."""
+    refinement: float = 1.0
+    """Edge of a voxel of the experiment over the edge of a reconstructed one, from which volumes are sampled."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PairStamps:
     """Stamps of the results of one pair."""
@@ -132,25 +146,12 @@ def of_guard(experiment: Experiment, calibration: str, pairs: Sequence[int], bac
     )
 
 
-def of_pair(
-    experiment: Experiment,
-    calibration: str,
-    pair: int,
-    *,
-    background: str | None = None,
-    guard: Layers = NO_LAYERS,
-    refinement: float = 1.0,
-) -> PairStamps:
-    """Return the stamps of the volumes and of the vectors of a pair.
-
-    `calibration` is the hash of its stamp, `background` the hash of the light that is subtracted from the images,
-    `guard` the guard layers of the volumes, `refinement` the edge of their voxels over the edge of reconstructed
-    voxels.
-    """
+def of_pair(experiment: Experiment, inputs: Inputs, pair: int) -> PairStamps:
+    """Return the stamps of the volumes and of the vectors of a pair."""
     recording, start = experiment.recording, experiment.path.parent
-    parts = _of_light(experiment, calibration, background) | {
-        "guard": guard if guard != NO_LAYERS else None,
-        "refinement": refinement if refinement != 1 else None,
+    parts = _of_light(experiment, inputs.calibration, inputs.background) | {
+        "guard": inputs.guard if inputs.guard != NO_LAYERS else None,
+        "refinement": inputs.refinement if inputs.refinement != 1 else None,
     }
     frames = experiment.pair_frames(pair)
 

@@ -15,9 +15,9 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
-from lfpiv.geometry.grid import Layers
 from lfpiv.progress import StepProgress
 from lfpiv.results.pair_files import VolumeFile
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs.frame_light import FrameLight, frame_light, read_darks
 from lfpiv.runs.pair_volumes import Reconstructor, SequenceFrame
 from lfpiv.runs.side_threads import ReadAhead, Writer
@@ -36,10 +36,8 @@ class FrameWork:
     """The work on each frame of an experiment, with all its inputs."""
 
     experiment: Experiment
-    guard: Layers
-    """Layers of voxels that the grid of the weights has beyond the grid of the experiment; cut away afterwards."""
-    refinement: float
-    """Edge of a voxel of the experiment over the edge of the weights' voxels, from which volumes are sampled."""
+    inputs: Inputs
+    """What all its volumes depend on."""
     weights: Weights | None
     """None if all volumes are in the folder."""
     cameras: Mapping[str, CalibratedCamera]
@@ -86,8 +84,8 @@ class FrameWork:
         return Reconstructor(
             experiment=self.experiment,
             weights=self.weights,
-            guard=self.guard,
-            refinement=self.refinement,
+            guard=self.inputs.guard,
+            refinement=self.inputs.refinement,
         )
 
     def require_weights(self, file: VolumeFile) -> None:

@@ -176,8 +176,8 @@ def prepare(
             experiment=current.experiment,
             calibration=prepared.calibration,
             weights=weights,
-            guard=work.guard,
-            refinement=work.refinement,
+            guard=work.inputs.guard,
+            refinement=work.inputs.refinement,
             work=work,
         )
 

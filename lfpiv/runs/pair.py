@@ -47,9 +47,6 @@ class PairWork(FrameWork):
     """The work on each pair of an experiment, with all its inputs."""
 
     folder: Folder
-    calibration_hash: str
-    background: str | None = None
-    """Hash of the light that is subtracted from the images; None if there is none."""
     vectors: bool = True
     """Correlate the volumes and write the vectors."""
     refusals: tuple[Warning, ...] = ()
@@ -114,15 +111,7 @@ class PairWork(FrameWork):
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(
-            self.experiment,
-            self.calibration_hash,
-            self.folder,
-            pair,
-            background=self.background,
-            guard=self.guard,
-            refinement=self.refinement,
-        )
+        return PairFiles.of(self.experiment, self.inputs, self.folder, pair)
 
     def _do(self, pair: int, frames: Frames, progress: StepProgress) -> None:
         files = self.files(pair)

@@ -284,13 +284,10 @@ def pair_work(
     return PairWork(
         experiment=run.experiment,
         folder=run.folder,
-        calibration_hash=run.calibration_stamp.hash,
-        guard=run.guard_layers,
-        refinement=run.refinement_factor,
+        inputs=run.inputs,
         weights=weights,
         cameras=cameras,
         keep_volumes=keep_volumes,
-        background=run.background,
         vectors=vectors,
         refusals=run.earlier.refusals if figures is None else figures.agreement.refusals,
     )

@@ -29,6 +29,7 @@ from lfpiv.results import provenance, stamps, summary_file
 from lfpiv.results.folder import Folder, VectorFiles, make_writable
 from lfpiv.results.pair_files import PairFiles
 from lfpiv.results.provenance import Stamp
+from lfpiv.results.stamps import Inputs
 from lfpiv.results.track_files import track_figures
 from lfpiv.runs import bootstrap, guard, memory, odd_pairs, pair_figures, refinement, summary
 from lfpiv.runs.finished_pairs import FinishedPairs
@@ -166,8 +167,12 @@ class Run:
 
     def has_light_of(self, other: Run) -> bool:
         """Return whether the volumes of both runs have the same subtracted light and the same reconstructed grid."""
-        own, others = ((run.background, run.guard_layers, run.refinement_factor) for run in (self, other))
-        return own == others
+        return self.inputs == other.inputs
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the volumes of all pairs depend on."""
+        return Inputs(self.calibration_stamp.hash, self.background, self.guard_layers, self.refinement_factor)
 
     @property
     def reconstructed_experiment(self) -> Experiment:
@@ -176,15 +181,7 @@ class Run:
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(
-            self.experiment,
-            self.calibration_stamp.hash,
-            self.folder,
-            pair,
-            background=self.background,
-            guard=self.guard_layers,
-            refinement=self.refinement_factor,
-        )
+        return PairFiles.of(self.experiment, self.inputs, self.folder, pair)
 
     def damping_stamp(self, pairs: Sequence[int]) -> Stamp:
         """Return the stamp of the damping by ghosts that was measured with some pairs."""

@@ -24,8 +24,8 @@ from lfpiv import warn
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import size_text, writing
-from lfpiv.geometry.grid import Layers
 from lfpiv.results.folder import Folder
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs.pair import PairWork
 from lfpiv.version import __version__
 
@@ -48,11 +48,8 @@ class Task(BaseModel):
     version: str
     experiment: Experiment
     folder: Folder
-    calibration_hash: str
-    guard: Layers
-    refinement: float
+    inputs: Inputs
     keep_volumes: bool
-    background: str | None
     refusals: str
     """JSON text of `PairWork.refusals`."""
     vectors: bool
@@ -67,13 +64,10 @@ class Task(BaseModel):
         return PairWork(
             experiment=self.experiment,
             folder=self.folder,
-            calibration_hash=self.calibration_hash,
-            guard=self.guard,
-            refinement=self.refinement,
+            inputs=self.inputs,
             weights=None,
             cameras={},
             keep_volumes=self.keep_volumes,
-            background=self.background,
             refusals=warn.from_text(self.refusals),
             vectors=self.vectors,
             scratch=shared / INSTANTS,
@@ -103,11 +97,8 @@ def write_task(work: PairWork, device: str, threads: int | None) -> Path:
         version=__version__,
         experiment=experiment,
         folder=dataclasses.replace(work.folder, path=work.folder.path.absolute()),
-        calibration_hash=work.calibration_hash,
-        guard=work.guard,
-        refinement=work.refinement,
+        inputs=work.inputs,
         keep_volumes=work.keep_volumes,
-        background=work.background,
         refusals=warn.to_text(work.refusals),
         vectors=work.vectors,
         weights=None if work.weights is None else save_weights(work.weights, base / WEIGHTS),

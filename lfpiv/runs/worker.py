@@ -107,7 +107,7 @@ def _open(shared: Path, threads: Callable[[], int]) -> PairWork:
         raise InputError(f"{where}: {error}") from None
     work = task.work(shared)
     calibration = load_calibration(work.folder.calibration)
-    if work.background is not None:
+    if work.inputs.background is not None:
         calibration = background.load(work.folder.background, calibration).seen_by(calibration)
     work = dataclasses.replace(work, cameras=calibration.cameras)
     if task.weights is not None:

@@ -13,6 +13,7 @@ from lfpiv.quantities import scale_of
 from lfpiv.report import flow, slice_panels
 from lfpiv.report import vectors as report
 from lfpiv.results import netcdf, provenance, stamps
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import pair_figures
 
 DIMS = ("z", "y", "x")
@@ -95,10 +96,10 @@ def test_another_mask_makes_another_volume(tiny_experiment):
     plain = open_experiment(tiny_experiment)
     box = '[[volume.solid]]\nkind = "box"\ncentre_mm = [0.4, 0.3, {z}]\nsize_mm = [0.2, 0.2, 0.2]\n'
     text = tiny_experiment.read_text()
-    found = [stamps.of_pair(plain, "", 0)]
+    found = [stamps.of_pair(plain, Inputs(""), 0)]
     for z in (0.3, 0.25):
         tiny_experiment.write_text(text.replace("[particles]", box.format(z=z) + "\n[particles]"))
-        found.append(stamps.of_pair(open_experiment(tiny_experiment), "", 0))
+        found.append(stamps.of_pair(open_experiment(tiny_experiment), Inputs(""), 0))
     assert len({stamp.volumes[0].hash for stamp in found}) == 3
     assert "mask" in found[1].volumes[0].changes(provenance.Marks(**found[2].volumes[0].attributes))
 
@@ -126,7 +127,7 @@ def test_a_changed_mask_of_a_frame_concerns_its_pairs_only(tiny_experiment, kind
     pairs = [pair for pair in experiment.numbers if pair != 0]
 
     def made():
-        return {pair: stamps.of_pair(experiment, "", pair).vectors for pair in pairs}
+        return {pair: stamps.of_pair(experiment, Inputs(""), pair).vectors for pair in pairs}
 
     before = {pair: provenance.Marks(**stamp.attributes) for pair, stamp in made().items()}
     file = tiny_experiment.parent / "5.nc"

@@ -10,6 +10,7 @@ from lfpiv.geometry.grid import NO_LAYERS
 from lfpiv.reconstruction.beyond import FaceLight
 from lfpiv.results import provenance, stamps
 from lfpiv.results.folder import Folder
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import guard, memory
 from lfpiv.runs.guard import Guard
 from lfpiv.warn import Code
@@ -37,7 +38,9 @@ def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, expe
 
 
 def test_results_with_guard_layers_are_others(experiment):
-    plain, guarded = (stamps.of_pair(experiment, "c", 0, guard=one) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0))))
+    plain, guarded = (
+        stamps.of_pair(experiment, Inputs("c", guard=one), 0) for one in (NO_LAYERS, ((1, 2), (0, 0), (0, 0)))
+    )
     marks = provenance.Marks(**plain.volumes[0].attributes)
     assert guarded.volumes[0].changes(marks) == ["guard"] and plain.volumes[0].fits(marks)
 

@@ -17,6 +17,7 @@ from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
 from lfpiv.results.provenance import Marks
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import guard, pair_figures, pipeline, refinement, rig
 from lfpiv.runs.invocation import Invocation
 from lfpiv.runs.run import open_run
@@ -160,13 +161,8 @@ def test_each_setting_concerns_what_depends_on_it(small_run, tmp_path, case):
     wanted = stamps.of_calibration(experiment)
     folder = Folder(small_run.out)
     (measured, _), (sized, _) = guard.read(folder), refinement.read(folder)
-    of_pair = stamps.of_pair(
-        experiment,
-        wanted.hash,
-        1,
-        guard=guard.layers(experiment, measured),
-        refinement=refinement.factor(experiment, sized),
-    )
+    layers, finer = guard.layers(experiment, measured), refinement.factor(experiment, sized)
+    of_pair = stamps.of_pair(experiment, Inputs(wanted.hash, guard=layers, refinement=finer), 1)
     marks = {
         "calibration": (small_run.out / "calibration.h5", wanted),
         "volumes": (small_run.out / "volumes" / "pair_0001_b.nc", of_pair.volumes[1]),
@@ -207,7 +203,7 @@ def test_images_are_told_apart_by_their_whole_path(small_run, tmp_path):
     experiment = read_experiment(file)
 
     def stamp(experiment):
-        return stamps.of_pair(experiment, "calibration", 0).vectors
+        return stamps.of_pair(experiment, Inputs("calibration"), 0).vectors
 
     made, swapped = Marks(**stamp(experiment).attributes), dataclasses.replace(experiment.recording, names=("b", "a"))
     exchanged = dataclasses.replace(experiment, recording=swapped)

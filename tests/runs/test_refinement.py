@@ -10,6 +10,7 @@ from lfpiv.experiment.mask import Mask
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.results import netcdf, provenance, stamps
 from lfpiv.results.folder import Folder
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import guard, memory, pipeline, refinement
 from lfpiv.runs.refinement import Refinement
 from lfpiv.settings.volume import Box
@@ -38,7 +39,7 @@ def test_the_outcome_is_stored_and_fits_until_the_volume_changes(small_run, expe
 
 
 def test_results_of_other_voxels_are_others(experiment):
-    plain, finer = (stamps.of_pair(experiment, "c", 0, refinement=one) for one in (1.0, 1.25))
+    plain, finer = (stamps.of_pair(experiment, Inputs("c", refinement=one), 0) for one in (1.0, 1.25))
     marks = provenance.Marks(**plain.volumes[0].attributes)
     assert finer.volumes[0].changes(marks) == ["refinement"] and plain.volumes[0].fits(marks)
 

@@ -13,6 +13,7 @@ import lfpiv
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.results.folder import Folder
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import task
 from lfpiv.runs.pair import PairWork
 
@@ -31,13 +32,10 @@ def work(request, tiny_experiment, tmp_path, monkeypatch):
     return PairWork(
         experiment=experiment,
         folder=Folder(tmp_path / "out", experiment.recording),
-        calibration_hash="a1",
-        guard=((1, 2), (0, 0), (3, 4)),
-        refinement=1.25,
+        inputs=Inputs("a1", "b2", ((1, 2), (0, 0), (3, 4)), 1.25),
         weights=None,
         cameras={},
         keep_volumes=True,
-        background="b2",
     )
 
 
@@ -67,7 +65,7 @@ def test_a_worker_reads_the_work_that_the_run_wrote(work, tmp_path, monkeypatch)
     if work.experiment.mask is not None:
         frame = work.experiment.pair_frames(0)[0]
         np.testing.assert_array_equal(found.experiment.solid(frame), work.experiment.solid(frame))
-    for name in ("folder", "calibration_hash", "guard", "refinement", "keep_volumes", "background", "vectors"):
+    for name in ("folder", "inputs", "keep_volumes", "vectors"):
         assert getattr(found, name) == getattr(work, name), name
     assert found.scratch is not None and found.scratch.parent == shared
     for path in (shared, shared.parent, work.folder.shared):

@@ -24,6 +24,7 @@ from lfpiv.errors import ClusterError, InputError, StorageError
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
 from lfpiv.results import datasets, netcdf, provenance, stamps
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import cluster_workers, dispatch, guard, local_workers, memory, pipeline, worker_plan
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.work_units import cut
@@ -296,7 +297,7 @@ def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, t
     for pair in range(pairs):
         path = out / "vectors" / f"pair_{pair:04d}.nc"
         path.write_bytes(content)
-        marks = stamps.of_pair(experiment, calibration, pair, guard=least, refinement=1.0).vectors.attributes
+        marks = stamps.of_pair(experiment, Inputs(calibration, guard=least), pair).vectors.attributes
         stamp = marks | {datasets.FILE: path.name}
         rewrite(path, lambda file, stamp=stamp: file.attrs.update(stamp), sealed=True)
     opened, read_marks = [], provenance.read_marks

@@ -10,6 +10,7 @@ from distributed import KilledWorker
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.experiment.recording import Recording
 from lfpiv.results.folder import Folder
+from lfpiv.results.stamps import Inputs
 from lfpiv.runs import dispatch, guard, refinement
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.work_units import cut
@@ -56,9 +57,7 @@ def make_work(small_run, file: Path, out: Path) -> PairWork:
     return PairWork(
         experiment=experiment,
         folder=Folder(out, experiment.recording),
-        calibration_hash=stamp,
-        guard=layers,
-        refinement=finer,
+        inputs=Inputs(stamp, guard=layers, refinement=finer),
         weights=build_weights(calibration, experiment.grid.padded(layers).refined(finer)),
         cameras=calibration.cameras,
         keep_volumes=False,
