@@ -20,7 +20,18 @@ from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts
-from lfpiv.selfcalibration.belonging import FLIPS, IN_TIME, SURE, ImageFit, Images, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration.belonging import (
+    CLEAR,
+    FLIPS,
+    IN_TIME,
+    SURE,
+    ImageFit,
+    Images,
+    Judgement,
+    Kind,
+    Mistake,
+    judge,
+)
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes
 from lfpiv.selfcalibration.frame_order import exchanged, own_motion
 from lfpiv.warn import Code, Warning, name_pairs, warn
@@ -83,11 +94,15 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
         )
     for warning in _dark_warnings(weights, _light(shown, dict.fromkeys((*judged, *tried)))):
         warn(log, warning)
-    found = moved_cameras.check(shown, weights)
+    found = moved_cameras.check(shown, weights, in_time=any(one.in_order for one in judged.values()))
     cameras, used = " and ".join(names), name_pairs(list(judged), experiment.noun)
     if isinstance(found, CameraDisparity):
-        return _told(_agreement(cameras, experiment, found, judged), disparity=found)
-    if len(found) >= LEAST_FOR_NOTHING and not any(one.fits for one in judged.values()):
+        return _told(_agreement(cameras, experiment, found) + _not_told(names, judged), disparity=found)
+    if any(one.fits for one in judged.values()):
+        return _told(
+            f"{cameras} show the same particles in {used}, how far apart cannot be told{_not_told(names, judged)}"
+        )
+    if len(found) >= LEAST_FOR_NOTHING:
         text = f"{cameras} show no particles in common"
         figures = {"names": cameras, "search": SEARCH_VOXEL, "found": text}
         nothing = Warning(code=Code.NOTHING_IN_COMMON, figures=figures)
@@ -153,7 +168,7 @@ def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreemen
     return agreement
 
 
-def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity, judged: Mapping[int, Judgement]) -> str:
+def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity) -> str:
     """Return how well cameras agree, for people."""
     used = name_pairs(found.pairs, experiment.noun)
     if found.voxel > found.std_voxel:
@@ -161,14 +176,24 @@ def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity, jud
         text += f"{found.std_voxel:.2f}"
     else:
         text = f"{cameras} show the particles of {used} at the same places, within {found.std_voxel:.2f} voxel"
-    if not any(one.in_order for one in judged.values()):
-        what = (
-            "move too little to tell the order of frames"
-            if any(one.fits for one in judged.values())
-            else ("do not tell whether images are exchanged or mirrored")
-        )
-        text += f"; they {what}"
     return text
+
+
+def _not_told(names: Sequence[str], judged: Mapping[int, Judgement]) -> str:
+    """Return what the images of the judged pairs do not tell, or put in doubt, for people; empty if they tell all."""
+    if any(one.in_order for one in judged.values()):
+        return ""
+    if not any(one.fits for one in judged.values()):
+        return "; they do not tell whether images are exchanged, mirrored or late"
+    doubted = [made for one in judged.values() if (made := one.doubted)]
+    if len(doubted) < len(judged):
+        return "; they do not tell the order of frames"
+    cameras = (
+        names if len(names) == 2 else dict.fromkeys(name for made in doubted for one in made for name in one.cameras)
+    )
+    return (
+        f"; the frames of {' or '.join(cameras)} would fit better if they were exchanged: check the order of its images"
+    )
 
 
 def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dict[int, Judgement]:
@@ -181,7 +206,7 @@ def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dic
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
             log.debug("images of %s are not compared: %s", shown.experiment.name_of(pair), error)
             continue
-        if judged[pair].fits:
+        if judged[pair].fits and not judged[pair].doubted:
             break
     return judged
 
@@ -209,6 +234,11 @@ def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int,
     If the images of no judged pair fit, a mistake that explains half of them or more was made in all pairs of the run.
     """
     each = {pair: one.mistakes for pair, one in judged.items() if one.mistakes}
+    if judged and all(one.doubted for one in judged.values()):
+        together = reduce(Judgement.joined, judged.values())
+        order = [one for one in together.tried if one.kind is Kind.FRAMES]
+        if clear := [one for one in order if together.margin(one) < -CLEAR and together.as_good(order[0], one)]:
+            return [_refusal(experiment, names, clear)]
     if judged and not any(one.fits for one in judged.values()):
         if made := _shared(list(judged.values())):
             return [_refusal(experiment, names, made)]
@@ -251,15 +281,23 @@ def _shared(judged: Sequence[Judgement]) -> Sequence[Mistake]:
     Pairs that show mistakes agree on it, or else all pairs together show it in which it can be tried.
     """
     each = [one.mistakes for one in judged if one.mistakes]
-    agreed = [one for one in each[0] if all(one in others for others in each)] if each else []
-    if agreed and 2 * len(each) >= len(judged):
-        return agreed
-    for likeliest in dict.fromkeys(one.tried[0] for one in judged if one.tried):
-        having = [one for one in judged if likeliest in one.left]
-        made = reduce(Judgement.joined, having).mistakes
-        if likeliest in made and 2 * len(having) >= len(judged) and all(likeliest in others for others in each):
-            return made
-    return []
+    known: dict[Mistake, list[Judgement]] = {}
+    for one in judged:
+        for mistake in one.tried:
+            known.setdefault(mistake, []).append(one)
+    joint = {one: reduce(Judgement.joined, found) for one, found in known.items() if 2 * len(found) >= len(judged)}
+    made = [one for one in each[0] if all(one in others for others in each)] if 2 * len(each) >= len(judged) > 0 else []
+    if not made and joint:
+        likeliest = min(joint, key=lambda one: joint[one].margin(one))
+        shown = likeliest in joint[likeliest].mistakes and all(likeliest in others for others in each)
+        made = [likeliest, *joint[likeliest].mistakes] if shown else []
+    if not made:
+        return []
+    for rival in joint:  # pairs at either end of a recording do not have all delays
+        both = [one for one in known[made[0]] if rival in one.left and rival != made[0]]
+        if both and reduce(Judgement.joined, both).as_good(made[0], rival):
+            made.append(rival)
+    return list(dict.fromkeys(made))
 
 
 def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:
@@ -268,17 +306,19 @@ def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:
 
 def _refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> Warning:
     """Return the warning about the mistakes of which one was made."""
-    best = made[0]
-    alike = [one for one in made if one.kind is best.kind and one.late == best.late]
-    cameras = list(dict.fromkeys(name for one in alike for name in one.cameras))
-    if best.kind in IN_TIME and len(names) == 2:
-        cameras = list(names)
-    text, remedy = _words(experiment, best, cameras)
-    return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy})
+    kinds = dict.fromkeys(one.kind for one in made)
+    told = [_words(experiment, names, [one for one in made if one.kind is kind]) for kind in kinds]
+    found, remedies = (list(dict.fromkeys(texts)) for texts in zip(*told, strict=True))
+    return Warning(code=Code.MISMATCHED, figures={"found": ", or ".join(found), "remedy": ". Or: ".join(remedies)})
 
 
-def _words(experiment: Experiment, mistake: Mistake, cameras: Sequence[str]) -> tuple[str, str]:
-    """Return what is wrong with the images of a camera, or of one of several, and what to do."""
+def _words(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> tuple[str, str]:
+    """Return what is wrong with the images of a camera, or of one of several, and what to do.
+
+    Of `made`, mistakes of one kind, one was made. Of two cameras only the first was tried in time.
+    """
+    mistake, either_of_two = made[0], made[0].kind in IN_TIME and len(names) == 2
+    cameras = list(names) if either_of_two else list(dict.fromkeys(name for one in made for name in one.cameras))
     either = " or ".join(cameras)
     if mistake.kind is Kind.CAMERAS:
         return (
@@ -301,11 +341,14 @@ def _words(experiment: Experiment, mistake: Mistake, cameras: Sequence[str]) -> 
             f"Set {keys} if white and board images are mirrored, too; otherwise store the particle images as those are"
         )
     noun = "image" if mistake.kind is Kind.SHIFTED else experiment.noun
+    remedy = f"Give images of the same instant the same {experiment.noun} and frame"
+    if len({one.late for one in made}) > 1:
+        return f"the images of {either} are of another {noun}", remedy
     count = f"{abs(mistake.late)} {noun}{'s' if abs(mistake.late) > 1 else ''}"
     when, other = ("late", "early") if mistake.late > 0 else ("early", "late")
-    text = f"the images of {cameras[0]} are {count} {when}"
-    text += f", or those of {cameras[1]} {other}" if len(cameras) == 2 else ""
-    return text, f"Give images of the same instant the same {experiment.noun} and frame"
+    if either_of_two:
+        return f"the images of {cameras[0]} are {count} {when}, or those of {cameras[1]} {other}", remedy
+    return f"the images of {either} are {count} {when}", remedy
 
 
 def _flipped(known: str, kind: Kind) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,9 @@ LIKE = 0.5
 
 AGREEING = 2
 """Least number of pairs that agree on cameras that moved, where more than one was used: chance peaks differ by pair."""
+
+LONE_STD_VOXEL = 0.4
+"""Standard error of a distance that one part of the volume shows in one pair, and nothing confirms [voxel]."""
 
 KEPT_BYTES = 64 << 20
 """Memory of the images that are kept while pairs are compared. Small images are read once in place of three times."""
@@ -155,11 +158,12 @@ def correct(
     )
 
 
-def check(shown: ShownParticles, weights: Weights) -> CameraDisparity | Sequence[int]:
+def check(shown: ShownParticles, weights: Weights, *, in_time: bool) -> CameraDisparity | Sequence[int]:
     """Measure how far apart the cameras show the same particles; warn if it is far.
 
-    Uses one pair after another until the answer is clear. Return the pairs that show clear particles and none in common
-    if that is all there is.
+    Uses one pair after another until the answer is clear. `in_time`: no camera is late; else the warning names that
+    cause, too, since a camera that is late in a uniform flow shows all particles equally far apart. Return the pairs
+    that show clear particles and none in common if that is all there is.
     """
     experiment, volumes, used, fit = shown.experiment, CameraVolumes(weights), list[int](), None
     nothing, limit_mm = list[int](), LARGE_VOXEL * experiment.grid.voxel_mm
@@ -179,6 +183,8 @@ def check(shown: ShownParticles, weights: Weights) -> CameraDisparity | Sequence
                 nothing.append(pair)
             continue
         fit = fit_movements(found, list(weights.cameras), experiment.grid)
+        if len(found) == len(used) == 1:
+            fit = replace(fit, scatter_mm=LONE_STD_VOXEL * experiment.grid.voxel_mm)
         if fit.separation.differs_from(limit_mm) and (fit.separation.mm < limit_mm or _agree(volumes, used, fit)):
             break
     if fit is None:
@@ -186,7 +192,7 @@ def check(shown: ShownParticles, weights: Weights) -> CameraDisparity | Sequence
     separation = fit.separation
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
     if disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
-        warn(log, _apart(disparity, experiment, weights.cameras))
+        warn(log, _apart(disparity, experiment, weights.cameras, in_time=in_time))
     return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pairs=tuple(used))
 
 
@@ -273,12 +279,17 @@ def all_show_particles(frames: Sequence[Mapping[str, np.ndarray]], cameras: Mapp
     )
 
 
-def _apart(disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera]) -> Warning:
+def _apart(
+    disparity: float, experiment: Experiment, cameras: Mapping[str, CalibratedCamera], *, in_time: bool
+) -> Warning:
     names = " and ".join(cameras) if len(cameras) == 2 else "the cameras"
+    cause = "a camera moved since the board was recorded" + ("" if in_time else ", or its images are late or early")
     advice = (
         "record the board again"
         if experiment.self_calibration.pairs
         else f"set self_calibration.pairs = {min(5, experiment.pairs)}, or record the board again"
     )
+    advice = advice if in_time else f"compare the order of the images of all cameras; if it is right, {advice}"
     distance_mm = disparity * experiment.grid.voxel_mm
-    return Warning(code=Code.APART, figures={"names": names, "voxel": disparity, "mm": distance_mm, "advice": advice})
+    figures = {"names": names, "voxel": disparity, "mm": distance_mm, "cause": cause, "advice": advice}
+    return Warning(code=Code.APART, figures=figures)

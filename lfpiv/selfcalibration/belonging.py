@@ -209,6 +209,8 @@ class Judgement:
     """Camera of each part of the sensors, shape (part,)."""
     turned: Mapping[Mistake, Sequence[np.ndarray]] = field(default_factory=dict)
     """Mistake -> light that is unexplained without it and with an image turned, of the likeliest mistake."""
+    apart: int = 1
+    """Least distance at which pairs, or instants, show other particles."""
 
     def margin(self, mistake: Mistake) -> float:
         """Return the advantage of the images as they are over those without a mistake [standard errors]."""
@@ -232,18 +234,29 @@ class Judgement:
         """Return whether images without a mistake fit clearly better than those of other particles.
 
         Images that do not fit differ by more than their standard errors, since what a particle leaves reaches over
-        several parts. So the spread of their light counts, too. If a camera is late, the images as they are show other
-        particles as well. Turned images leave more light than those of other particles, so they are the last resort.
+        several parts. So the spread of their light counts, too. If a camera is late by pairs, the images as they are
+        show other particles as well. Turned images leave more light than those of other particles, so they are the last
+        resort.
         """
-        others = [self.left[one] for one in self.chance if one not in (best, *self._partners) and one in self.left]
-        others += [self.left[RIGHT]] if best.kind in (Kind.LATE, Kind.SHIFTED) else []
+        chance = [one for one in self.chance if one not in self._partners and not self._alike(one, best)]
+        others = [self.left[one] for one in chance if one in self.left]
+        others += [self.left[RIGHT]] if best.kind is Kind.LATE else []
         others = others or ([self.turned[best]] if best in self.turned else [])
         if not others:
             return False
         count = min(len(frames) for frames in (*others, self.left[best]))
-        level, *chance = (sum(float(one.sum()) for one in frames[:count]) for frames in (self.left[best], *others))
+        level, *levels = (sum(float(one.sum()) for one in frames[:count]) for frames in (self.left[best], *others))
         clear = all(advantage(self.left[best], frames) > CLEAR for frames in others)
-        return clear and level < 2 * min(chance) - max(chance)
+        return clear and level < 2 * min(levels) - max(levels)
+
+    def _alike(self, one: Mistake, other: Mistake) -> bool:
+        """Return whether two mistakes put images of the same particles into a camera."""
+        if one == other:
+            return True
+        images = {Kind.LATE: 2, Kind.SHIFTED: 1}  # single images of a step
+        if one.cameras != other.cameras or one.kind not in images or other.kind not in images:
+            return False
+        return abs(images[one.kind] * one.late - images[other.kind] * other.late) < 2 * self.apart
 
     @property
     def fits(self) -> bool:
@@ -261,6 +274,18 @@ class Judgement:
     def in_order(self) -> bool:
         """Whether the images also fit clearly better than those of other frames."""
         return self.fits and all(self.margin(one) > SURE for one in self.tried)
+
+    @property
+    def doubted(self) -> tuple[Mistake, ...]:
+        """Exchanged frames that would fit better than the order as it is, the likeliest first, with others as likely.
+
+        Images that fit beat chance, so their order alone is in doubt.
+        """
+        order = [one for one in self.tried if one.kind is Kind.FRAMES and self.margin(one) < -SURE]
+        if not self.fits or not order:
+            return ()
+        best = self.left[order[0]]
+        return tuple(one for one in order if advantage(best, self.left[one]) < SURE)
 
     @property
     def over_chance(self) -> float:
@@ -294,6 +319,10 @@ class Judgement:
             counts = self.camera_of_part != one.cameras[0]
         return [(b - a)[counts] for a, b in zip(self.left[RIGHT], self.left[one], strict=False)]
 
+    def as_good(self, mistake: Mistake, rival: Mistake) -> bool:
+        """Return whether the images without another mistake fit better than, or as well as, those without this one."""
+        return advantage(self.left[mistake], self.left[rival]) < SURE
+
     def joined(self, other: Judgement) -> Judgement:
         """Return the judgement by the frames of both, about the mistakes that were tried in both."""
 
@@ -304,7 +333,7 @@ class Judgement:
 
         left = both(self.left, other.left)
         chance = [one for one in self.chance if one in left]
-        return Judgement(left, chance, self.camera_of_part, both(self.turned, other.turned))
+        return Judgement(left, chance, self.camera_of_part, both(self.turned, other.turned), self.apart)
 
 
 def judge(
@@ -362,6 +391,7 @@ class _Trials:
     def __init__(self, fit: ImageFit, shown: Shown, pair: int, others: Sequence[int]):
         self._fit, self._shown, self._pair = fit, shown, pair
         self._left: dict[Mistake, list[np.ndarray]] = {}
+        self._apart = min((abs(number) for number in others), default=1)
         cameras = list(fit.weights.cameras)
         late = [number for number in others if shown(pair + number, 0) is not None]
         kinds = dict.fromkeys(cameras, Kind.LATE) | ({cameras[1]: Kind.OTHER} if len(cameras) == 2 else {})
@@ -377,7 +407,8 @@ class _Trials:
                 if len(left) == frame and (right := one.undone(self._shown, self._pair, frame)) is not None:
                     left.append(self._fit.unexplained(right, one.cameras[0] if one.kind is Kind.CHANCE else None))
         known = {one: left for one, left in self._left.items() if left}
-        return Judgement(known, [one for one in self.chance if one in known], self._fit.camera_of_part)
+        chance = [one for one in self.chance if one in known]
+        return Judgement(known, chance, self._fit.camera_of_part, apart=self._apart)
 
     def settled(self, found: Judgement, single_images: bool) -> Judgement | None:
         """Return the judgement if the images fit and at most the order of frames is in doubt, otherwise None.

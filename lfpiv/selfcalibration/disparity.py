@@ -63,6 +63,10 @@ LEVEL = 0.1
 """Square of the sine below which the lines of sight count as normal to y: 18 degrees."""
 SIGNIFICANT = 1.5
 """Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
+SAME_VOXEL = 2.0
+"""Distance across the lines of sight within which two lags are on the same peak [voxel]."""
+ELSEWHERE = 3.0
+"""Least excess of a peak farther away over the coefficients of the expected place [standard deviation of chance]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,7 +261,9 @@ def _disparity(
 ) -> Disparity | None:
     """Measure the disparity of two cameras' volumes in a window; None if there is no clear peak.
 
-    `slanted` is from `slant`. `near_mm` limits the search to `NEAR_VOXEL` around another disparity.
+    The highest of many chance peaks may exceed the right one in dense seeding. So a peak where none is expected must
+    stand out from the coefficients where it is: at cameras that stand still, or at `near_mm`. `slanted` is from
+    `slant`. `near_mm` limits the search to `NEAR_VOXEL` around another disparity.
     """
     first, second = volumes
     centre, reach = np.zeros(3, int), SEARCH_VOXEL
@@ -274,16 +280,24 @@ def _disparity(
     searched = np.linalg.norm(slanted @ lags[::-1], axis=0) <= SLANT_VOXEL
     searched &= (np.abs(lags - centre[:, None]) <= reach - FIT_REACH).all(0)
     searched = searched.reshape(coefficient.shape)
-    place = np.unravel_index(int(np.where(searched, coefficient, -1).argmax()), coefficient.shape)
-    peak, rival = float(coefficient[place]), float(mirrored[searched].max())
-    if not peak >= SIGNIFICANT * rival:
+    highest = np.unravel_index(int(np.where(searched, coefficient, -1).argmax()), coefficient.shape)
+    peak, rival = float(coefficient[highest]), float(mirrored[searched].max())
+    across = np.eye(3) - slanted
+    from_peak, from_expected = (
+        np.linalg.norm(across @ (lags - place[:, None])[::-1], axis=0).reshape(coefficient.shape)
+        for place in (lags[:, np.ravel_multi_index(highest, coefficient.shape)], centre)
+    )
+    expected = coefficient[searched & (from_expected <= SAME_VOXEL) & (from_peak > SAME_VOXEL)]
+    needed = SIGNIFICANT * rival
+    if from_expected[highest] > SAME_VOXEL and expected.size:
+        needed = max(needed, float(expected.max()) + ELSEWHERE * float(mirrored[searched].std()))
+    if not peak >= needed:
         return None
-    fitted = fit_peak(coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in place)])
+    fitted = fit_peak(coefficient[tuple(slice(i - FIT_REACH, i + FIT_REACH + 1) for i in highest)])
     if fitted is None:
         return None
     offset, curvature = fitted
-    across = np.eye(3) - slanted
-    lag = np.array(place)[::-1] - reach + centre[::-1] + offset
+    lag = np.array(highest)[::-1] - reach + centre[::-1] + offset
     corner = [grid.axis_mm(axis)[part.start : part.stop] for axis, part in enumerate(window)]
     return Disparity(
         cameras=cameras,

@@ -45,6 +45,8 @@ LOWERED_SIGMAS = 3.0
 """Least decrease of a significant distance by which a correction counts [standard errors]."""
 LEAST_VARIANCE = 1e-9
 """Least variance of a movement of the cameras against each other, as a share of the largest one."""
+LEFT_OUT = 8
+"""Largest number of groups of disparities that are left out in turn."""
 OUTLIER = 2.0
 """Residual at which a disparity's weight is a quarter, as a multiple of 1.5 times the median residual."""
 
@@ -125,6 +127,8 @@ class MovementFit:
     """Mean over the disparities of the matrix whose quadratic form with `values` is the squared observable distance."""
     freedom: float
     """Degrees of freedom of the covariance's scale."""
+    scatter_mm: float = 0.0
+    """Standard error of the observable distance by fits without some of the disparities [mm]."""
 
     @property
     def separation(self) -> Separation:
@@ -134,7 +138,8 @@ class MovementFit:
         slope = self.observed @ self.values
         spread = float(slope @ self.covariance @ slope)
         std = np.sqrt(spread / square) if square > by_errors else np.sqrt(by_errors)
-        return Separation(mm=float(np.sqrt(max(square - by_errors, 0.0))), std_mm=float(std), sigmas=self.sigmas)
+        std_mm = max(float(std), self.scatter_mm)
+        return Separation(mm=float(np.sqrt(max(square - by_errors, 0.0))), std_mm=std_mm, sigmas=self.sigmas)
 
     @property
     def sigmas(self) -> float:
@@ -295,7 +300,20 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
     A disparity is the difference of two cameras' movements. Its weight is its `Disparity.weight` over the variance of
     the residuals. Outliers get less weight (Geman and McClure). A weak prior holds movements without an effect on
     disparities near zero, among them the mean of all cameras.
+
+    Residuals say nothing of a movement that one disparity alone shows. So the standard error of the distance is at
+    least what the jackknife gives, which leaves out disparities in turn.
     """
+    whole = _fitted(found, cameras, grid)
+    groups = min(len(found), LEFT_OUT)
+    if groups < 2:
+        return whole
+    kept = ([one for number, one in enumerate(found) if number % groups != left] for left in range(groups))
+    mm = np.array([_fitted(some, cameras, grid).explained_mm for some in kept])
+    return replace(whole, scatter_mm=float(np.sqrt((groups - 1) * mm.var())))
+
+
+def _fitted(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> MovementFit:
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
     prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))

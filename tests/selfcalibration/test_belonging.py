@@ -13,7 +13,7 @@ from lfpiv.calibration.camera import Calibration
 from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.runs.reversed_pairs import reversed_pairs
-from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Kind, Mistake, judge
+from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Judgement, Kind, Mistake, judge
 from lfpiv.warn import Code
 
 OTHERS, NEAR = (1, 2), (3,)
@@ -69,6 +69,54 @@ def test_what_was_done_to_one_camera_is_named(rig, shown, wrong, named):
 
     found = judged(rig, mistaken)
     assert found.mistakes[0] == named and not found.fits
+
+
+RIGHT = Mistake()
+PARTS = 60
+"""Parts of each of two sensors in judgements that are made here."""
+
+
+def judgement(levels, *, chance=(), apart=1, seed=1):
+    """Judge images by the light that mistakes leave, a level or the levels of two frames each."""
+    rng = np.random.default_rng(seed)
+    noise = rng.gamma(20.0, 1 / 20.0, (2, 2 * PARTS)) / (2 * PARTS)  # the same images in every trial
+    left = {
+        one: [level * part * rng.gamma(400.0, 1 / 400.0, 2 * PARTS) for part in noise] for one, level in levels.items()
+    }
+    return Judgement(left, list(chance), np.repeat(["left", "right"], PARTS), apart=apart)
+
+
+def test_delays_that_explain_as_much_are_named_together(rig):
+    late, early, other = (Mistake(Kind.LATE, ("left",), number) for number in (1, -1, -2))
+    judged = [
+        judgement({RIGHT: 0.31, late: 0.29, early: 0.29, other: 0.31}, chance=(late, early, other)),
+        judgement({RIGHT: 0.31, late: 0.29, other: 0.31}, chance=(late, other), seed=2),
+    ]
+    made = belonging._shared(judged)
+    assert set(made) == {late, early}
+    said = belonging._refusal(rig[0], ["left", "right"], made).figures["found"]
+    assert said == "the images of left or right are of another pair"
+
+
+def test_a_delay_is_found_beside_instants_that_show_the_same_particles():
+    """The neighbours of the right instant fit, too, so they are no measure of chance."""
+    true, near, far = (Mistake(Kind.LATE, ("left",), number) for number in (-2, -3, 3))
+    levels = {RIGHT: 0.54, true: 0.34, near: 0.44, far: 0.58}
+    assert judgement(levels, chance=(near, far), apart=3).mistakes == (true,)
+    assert not judgement(levels, chance=(near, far), apart=1).mistakes
+
+
+def test_exchanged_frames_are_refused_where_several_pairs_doubt_their_order(rig):
+    frames, other = Mistake(Kind.FRAMES, ("left",)), Mistake(Kind.LATE, ("left",), 1)
+    levels = {RIGHT: 0.160, frames: 0.157, other: 0.22}
+    judged = {pair: judgement(levels, chance=(other,), seed=pair) for pair in range(2)}
+    names = ["left", "right"]
+    assert all(one.doubted == (frames,) and not one.mistakes for one in judged.values())
+    (refusal,) = belonging._refusals(rig[0], names, judged)
+    assert refusal.figures["found"] == "the frames a and b of left or right are exchanged"
+    alone = {0: judged[0]}
+    assert not belonging._refusals(rig[0], names, alone)
+    assert "left or right would fit better if they were exchanged" in belonging._not_told(names, alone)
 
 
 def test_images_of_two_cameras_that_are_exchanged_are_named(rig, shown):

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from support.small_run import small_scene
 
@@ -134,6 +135,36 @@ def test_rigid_movements_explain_their_disparities(count):
     assert fit.separation.mm == pytest.approx(told, rel=PRIOR_PULL) and fit.separation.significant
     kept = fit.along(fit.significant_directions(1.0)).movements
     assert all(np.allclose(kept[name].shift_mm, true[name].shift_mm, atol=PRIOR_PULL * 0.1) for name in names)
+
+
+def test_a_movement_that_one_disparity_alone_shows_is_not_significant():
+    """Its residual is zero by construction, however wrong it is."""
+
+    def one(cameras, at, shift):
+        across = np.diag([0.0, 1.0, 0.0])  # what two cameras in a horizontal plane show
+        centre_mm, shift_mm = np.array([*at, 0.0]), np.array([0.0, shift, 0.0])
+        return Disparity(
+            cameras=cameras, centre_mm=centre_mm, shift_mm=shift_mm, sharpness=across, peak=0.14, rival=0.06
+        )
+
+    places, names = [(-0.6, -0.65), (-0.6, 0.65), (0.6, 0.65)], ["left", "middle", "right"]
+    still = [one(("middle", "right"), at, shift) for at, shift in zip(places, (-0.011, -0.001, -0.029), strict=True)]
+    alone = movements.fit_movements([one(("left", "middle"), (0.6, 0.65), -0.122), *still], names, GRID)
+    assert alone.separation.mm > 0.03 and not alone.separation.significant
+    confirmed = [one(("left", "middle"), at, -0.122) for at in (*places, (0.6, -0.65))]
+    assert movements.fit_movements([*confirmed, *still], names, GRID).separation.significant
+
+
+@pytest.mark.parametrize(("at_rest", "found"), [(0.0, True), (0.5, False)])
+def test_a_peak_elsewhere_stands_out_from_the_coefficients_at_rest(at_rest, found):
+    rng, shape = np.random.default_rng(8), (12, 20, 24)
+    fields = [gaussian_filter(rng.standard_normal(shape), 0.7) for _ in range(3)]
+    first, second = fields[0], 0.55 * np.roll(fields[0], 5, axis=1) + at_rest * fields[0] + fields[1]
+    window, slanted = tuple(slice(0, edge) for edge in shape), np.diag([1.0, 0.0, 1.0])
+    told = disparity._disparity(([first], [second]), window, GRID, ("left", "right"), slanted)
+    assert (told is not None) == found
+    if told is not None:
+        assert told.shift_mm[1] == pytest.approx(0.5, abs=LATERAL_MM * 2)
 
 
 def test_shift_along_the_views_counts_for_little():
