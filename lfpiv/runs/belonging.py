@@ -81,7 +81,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     judged = _judge(as_judged, tried, weights)
     for light in islice(_light(shown, judged), 1):
         _log_scales(light[0])
-    refusals = _refusals(experiment, names, judged)
+    refusals = mistakes_of_pairs(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, shown, weights, list(judged))
     if not refusals and not any(one.in_order for one in judged.values()):
@@ -97,10 +97,10 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     found = moved_cameras.check(shown, weights, in_time=any(one.in_order for one in judged.values()))
     cameras, used = " and ".join(names), name_pairs(list(judged), experiment.noun)
     if isinstance(found, CameraDisparity):
-        return _told(_agreement(cameras, experiment, found) + _not_told(names, judged), disparity=found)
+        return _told(_agreement(cameras, experiment, found) + not_told(names, judged), disparity=found)
     if any(one.fits for one in judged.values()):
         return _told(
-            f"{cameras} show the same particles in {used}, how far apart cannot be told{_not_told(names, judged)}"
+            f"{cameras} show the same particles in {used}, how far apart cannot be told{not_told(names, judged)}"
         )
     if len(found) >= LEAST_FOR_NOTHING:
         text = f"{cameras} show no particles in common"
@@ -121,7 +121,7 @@ def refusals_of(shown: ShownParticles, fit: ImageFit, pair: int) -> list[Warning
         log.debug("images of %s are not compared: %s", experiment.name_of(pair), error)
         return []
     if found.mistakes:
-        return [_numbered(experiment, _refusal(experiment, names, found.mistakes), pair)]
+        return [_numbered(experiment, refusal(experiment, names, found.mistakes), pair)]
     if found.fits or found.over_chance > SURE or not moved_cameras.all_show_particles(light, shown.cameras):
         return []
     figures = {"found": f"{' and '.join(names)} show different particles", "remedy": "Check the images of this pair"}
@@ -179,7 +179,7 @@ def _agreement(cameras: str, experiment: Experiment, found: CameraDisparity) -> 
     return text
 
 
-def _not_told(names: Sequence[str], judged: Mapping[int, Judgement]) -> str:
+def not_told(names: Sequence[str], judged: Mapping[int, Judgement]) -> str:
     """Return what the images of the judged pairs do not tell, or put in doubt, for people; empty if they tell all."""
     if any(one.in_order for one in judged.values()):
         return ""
@@ -228,7 +228,7 @@ def _images(experiment: Experiment) -> Sequence[int]:
     return () if experiment.recording.is_series else (1, -1)
 
 
-def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
+def mistakes_of_pairs(experiment: Experiment, names: Sequence[str], judged: Mapping[int, Judgement]) -> list[Warning]:
     """Return the refusals of pairs by mistakes that were clearly made.
 
     If the images of no judged pair fit, a mistake that explains half of them or more was made in all pairs of the run.
@@ -238,13 +238,13 @@ def _refusals(experiment: Experiment, names: Sequence[str], judged: Mapping[int,
         together = reduce(Judgement.joined, judged.values())
         order = [one for one in together.tried if one.kind is Kind.FRAMES]
         if clear := [one for one in order if together.margin(one) < -CLEAR and together.as_good(order[0], one)]:
-            return [_refusal(experiment, names, clear)]
+            return [refusal(experiment, names, clear)]
     if judged and not any(one.fits for one in judged.values()):
-        if made := _shared(list(judged.values())):
-            return [_refusal(experiment, names, made)]
+        if made := shared_mistakes(list(judged.values())):
+            return [refusal(experiment, names, made)]
         if 2 * len(each) < len(judged):
             return []
-    return [_numbered(experiment, _refusal(experiment, names, made), pair) for pair, made in each.items()]
+    return [_numbered(experiment, refusal(experiment, names, made), pair) for pair, made in each.items()]
 
 
 def _far_delay(
@@ -256,7 +256,7 @@ def _far_delay(
         others, _ = _shifts(experiment, pair)
         found = judge(fit, shown, pair, others, [late for late in far if pair + late in experiment.numbers])
         if found.mistakes and found.mistakes[0].kind is Kind.LATE:
-            return [_refusal(experiment, names, found.mistakes)]
+            return [refusal(experiment, names, found.mistakes)]
     return []
 
 
@@ -272,10 +272,10 @@ def _opposite_motion(
         motions.append(own_motion(volumes.own(), weights.volume))
     cameras = exchanged(motions, weights.cameras, weights.volume) if motions else ()
     made = [Mistake(Kind.FRAMES, (name,)) for name in cameras]
-    return [_refusal(experiment, list(weights.cameras), made)] if made else []
+    return [refusal(experiment, list(weights.cameras), made)] if made else []
 
 
-def _shared(judged: Sequence[Judgement]) -> Sequence[Mistake]:
+def shared_mistakes(judged: Sequence[Judgement]) -> Sequence[Mistake]:
     """Return the mistake that was made in all pairs, with others that explain them as well; empty without any.
 
     Pairs that show mistakes agree on it, or else all pairs together show it in which it can be tried.
@@ -304,7 +304,7 @@ def _numbered(experiment: Experiment, warning: Warning, pair: int) -> Warning:
     return experiment.recording.by_result(warning.of_pair(pair))
 
 
-def _refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> Warning:
+def refusal(experiment: Experiment, names: Sequence[str], made: Sequence[Mistake]) -> Warning:
     """Return the warning about the mistakes of which one was made."""
     kinds = dict.fromkeys(one.kind for one in made)
     told = [_words(experiment, names, [one for one in made if one.kind is kind]) for kind in kinds]

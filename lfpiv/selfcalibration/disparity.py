@@ -179,10 +179,10 @@ class CameraVolumes:
         for pair in combinations(self.weights.cameras, 2):
             volumes = self._volumes[pair[0]], self._volumes[pair[1]]
             slanted = slant([self.weights.cameras[name] for name in pair], grid)
-            in_middle = _disparity(volumes, middle, grid, pair, slanted)
+            in_middle = disparity_in(volumes, middle, grid, pair, slanted)
             if in_middle is not None:
                 parts = [
-                    _disparity(volumes, window, grid, pair, slanted, near_mm=in_middle.shift_mm)
+                    disparity_in(volumes, window, grid, pair, slanted, near_mm=in_middle.shift_mm)
                     for window in cut_into_windows(grid)
                 ]
                 found += [part for part in parts if part is not None] or [in_middle]
@@ -251,7 +251,7 @@ def cut_into_windows(grid: Grid) -> list[tuple[slice, ...]]:
     ]
 
 
-def _disparity(
+def disparity_in(
     volumes: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
     window: tuple[slice, ...],
     grid: Grid,

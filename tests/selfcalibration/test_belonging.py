@@ -92,9 +92,9 @@ def test_delays_that_explain_as_much_are_named_together(rig):
         judgement({RIGHT: 0.31, late: 0.29, early: 0.29, other: 0.31}, chance=(late, early, other)),
         judgement({RIGHT: 0.31, late: 0.29, other: 0.31}, chance=(late, other), seed=2),
     ]
-    made = belonging._shared(judged)
+    made = belonging.shared_mistakes(judged)
     assert set(made) == {late, early}
-    said = belonging._refusal(rig[0], ["left", "right"], made).figures["found"]
+    said = belonging.refusal(rig[0], ["left", "right"], made).figures["found"]
     assert said == "the images of left or right are of another pair"
 
 
@@ -112,11 +112,11 @@ def test_exchanged_frames_are_refused_where_several_pairs_doubt_their_order(rig)
     judged = {pair: judgement(levels, chance=(other,), seed=pair) for pair in range(2)}
     names = ["left", "right"]
     assert all(one.doubted == (frames,) and not one.mistakes for one in judged.values())
-    (refusal,) = belonging._refusals(rig[0], names, judged)
+    (refusal,) = belonging.mistakes_of_pairs(rig[0], names, judged)
     assert refusal.figures["found"] == "the frames a and b of left or right are exchanged"
     alone = {0: judged[0]}
-    assert not belonging._refusals(rig[0], names, alone)
-    assert "left or right would fit better if they were exchanged" in belonging._not_told(names, alone)
+    assert not belonging.mistakes_of_pairs(rig[0], names, alone)
+    assert "left or right would fit better if they were exchanged" in belonging.not_told(names, alone)
 
 
 def test_images_of_two_cameras_that_are_exchanged_are_named(rig, shown):

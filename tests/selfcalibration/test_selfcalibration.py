@@ -161,7 +161,7 @@ def test_a_peak_elsewhere_stands_out_from_the_coefficients_at_rest(at_rest, foun
     fields = [gaussian_filter(rng.standard_normal(shape), 0.7) for _ in range(3)]
     first, second = fields[0], 0.55 * np.roll(fields[0], 5, axis=1) + at_rest * fields[0] + fields[1]
     window, slanted = tuple(slice(0, edge) for edge in shape), np.diag([1.0, 0.0, 1.0])
-    told = disparity._disparity(([first], [second]), window, GRID, ("left", "right"), slanted)
+    told = disparity.disparity_in(([first], [second]), window, GRID, ("left", "right"), slanted)
     assert (told is not None) == found
     if told is not None:
         assert told.shift_mm[1] == pytest.approx(0.5, abs=LATERAL_MM * 2)
