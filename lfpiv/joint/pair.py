@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from lfpiv.geometry.grid import AXES, Grid
 from lfpiv.geometry.resampling import volume_on
@@ -258,4 +259,5 @@ def reconstruct_pair(
         raise ValueError("first: expected no first guess of a pair; use `reconstruct` for one.")
     solver = PairSolver(weights, SmartSettings(**smart), estimate=estimate, correlation=correlation)
     masks = mask if isinstance(mask, (tuple, list)) else (mask, mask)
-    return list(solver.solve(images, floor, progress, masks=masks).to_dataarrays(grid))
+    with threadpool_limits(1, "blas"):  # its sums depend on its number of threads
+        return list(solver.solve(images, floor, progress, masks=masks).to_dataarrays(grid))

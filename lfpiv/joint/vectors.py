@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from lfpiv.geometry.grid import AXES
 from lfpiv.joint.pair import MOVED, UNSHARED, Estimate
@@ -99,7 +100,8 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
         return vectors
     alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
     vectors = correlate(*alone, dt_s=dt_s, **correlation)
-    return _merged(vectors, compare(vectors, volumes, alone), about).assign_attrs(about)
+    with threadpool_limits(1, "blas"):  # its sums depend on its number of threads
+        return _merged(vectors, compare(vectors, volumes, alone), about).assign_attrs(about)
 
 
 @dataclass(frozen=True)
