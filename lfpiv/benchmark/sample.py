@@ -1,4 +1,7 @@
-"""Errors of a result in the measurable region, all pairs together, and what follows from them at any weights."""
+"""Compare the vectors of a result with the truth, pair by pair, and compute the benchmark's figures of all pairs.
+
+The figures take a weight of each vector, so that a bootstrap over blocks of vectors can ask for them again.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ NAN = float("nan")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairErrors:
-    """Vectors of one pair or instant beside the truth [voxel], those that are numbers and lie in the volume."""
+    """Vectors of one pair or instant beside the truth; displacements in voxels.
+
+    It holds the vectors that are numbers, lie in the fluid of the volume, and have a known true displacement.
+    """
 
     number: int
     positions_mm: np.ndarray
@@ -28,21 +34,21 @@ class PairErrors:
     true: np.ndarray
     """True displacements over the result's window, shape (vector, 3)."""
     true_point: np.ndarray
-    """True displacements at the points, shape (vector, 3)."""
+    """True displacements at the points, shape (vector, 3). From particles, they are means over the reference window."""
     sigma: np.ndarray
     """Stated standard deviations, shape (vector, 3); NaN where there is none."""
     kept: np.ndarray
-    """Which vectors are stated as measured, shape (vector,)."""
+    """Which vectors the result calls valid, shape (vector,)."""
     scored: np.ndarray
-    """Which of these lie in the measurable region, shape (vector,)."""
+    """Which kept vectors lie in the measurable region, or within `SLACK_VOXEL` of it, shape (vector,)."""
     interior: np.ndarray
-    """Which vectors lie a reference window and more inside the faces, shape (vector,)."""
+    """Which vectors lie at least a reference window inside the faces, shape (vector,)."""
     size: np.ndarray
-    """Part of the measurable region that each vector stands for, shape (vector,)."""
+    """Part of the measurable region that each vector stands for, shape (vector,); 0 for vectors that are not kept."""
     outside: int
     """Number of vectors beyond the volume or in walls."""
     source: str
-    """What the truth is taken from."""
+    """`truth.FLOW` or `truth.PARTICLES`; empty for a pair without vectors."""
 
     @property
     def error(self) -> np.ndarray:
@@ -86,7 +92,7 @@ def pair_errors(measured: MeasuredField, truth: Truth) -> PairErrors:
 
 
 def missing_pair(number: int) -> PairErrors:
-    """Return what a pair without any vector gives."""
+    """Return the errors of a pair for which the result has no vectors."""
     rows, flags = np.empty((0, 3)), np.empty(0, bool)
     return PairErrors(
         number=number, positions_mm=rows, measured=rows, true=rows, true_point=rows, sigma=rows, kept=flags,
@@ -95,12 +101,12 @@ def missing_pair(number: int) -> PairErrors:
 
 
 class Sample:
-    """Vectors of all pairs of a result.
+    """Vectors of all pairs of a result, sorted by the length of their errors. All arrays have this order.
 
     Parameters
     ----------
     pairs : sequence of PairErrors
-        All pairs that are scored, also those without vectors.
+        All pairs that are scored, also pairs without vectors.
     truth : Truth
         The truth.
     outlier_voxel : float
@@ -110,7 +116,7 @@ class Sample:
     def __init__(self, pairs: Sequence[PairErrors], truth: Truth, outlier_voxel: float = figures.OUTLIER_VOXEL):
         self.pairs, self.truth, self.outlier_voxel = tuple(pairs), truth, outlier_voxel
         length = np.concatenate([np.linalg.norm(one.error, axis=1) for one in pairs])
-        order = np.argsort(length, kind="stable")  # quantiles of a sorted sample are found fast
+        order = np.argsort(length, kind="stable")  # a bootstrap takes many quantiles, which is fast in sorted values
 
         def joined(parts: Iterable[np.ndarray]) -> np.ndarray:
             values: np.ndarray = np.concatenate(list(parts))[order]
@@ -135,11 +141,17 @@ class Sample:
         return float(np.mean([one.completeness for one in self.pairs]))
 
     def curve(self) -> metrics.ErrorCurve:
-        """Return the errors over the part of the measurable region."""
+        """Return the error against the part of the measurable region in which it is not exceeded."""
         return metrics.error_curve(self.length, self.size, 1.0)
 
     def statistics(self, weight: np.ndarray) -> dict[str, float]:
-        """Return the figures of the vectors, each vector with a weight, shape (vector,)."""
+        """Return the figures of `figures` that follow from the vectors.
+
+        Parameters
+        ----------
+        weight : ndarray, shape (vector,)
+            How often each vector counts, such as its number of draws in a bootstrap.
+        """
         chosen = weight * self.scored
         median = metrics.weighted_quantile(self.length, 0.5, chosen)
         bound = figures.OUTLIER_NORMALISED * (median + figures.OUTLIER_FLOOR_VOXEL)
@@ -158,7 +170,7 @@ class Sample:
             "outliers_normalised": _mean(self.length > bound, chosen) if np.isfinite(bound) else NAN,
         }
         for part in figures.PARTS:
-            share = part / max(self.completeness, 1e-12)
+            share = part / max(self.completeness, 1e-12)  # of the kept vectors, who stand for less than the region
             value = metrics.weighted_quantile(self.length, share, weight * self.size) if share <= 1 + 1e-9 else NAN
             found[f"error_at_{round(100 * part)}"] = value
         for number, axis in enumerate("xyz"):
@@ -179,7 +191,10 @@ def _mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def _blocks(places_mm: np.ndarray, pair: np.ndarray, truth: Truth) -> np.ndarray:
-    """Return the number of the block of each vector: its pair, and a cube as large as a reference window."""
+    """Return the number of each vector's block of the bootstrap, shape (vector,).
+
+    A block holds the vectors of one pair in one box of the size of the reference window.
+    """
     cell = np.floor((places_mm - truth.scene.volume.centre_mm) / np.asarray(truth.reference_window_mm)).astype(int)
     if not len(cell):
         return np.empty(0, int)
@@ -189,7 +204,7 @@ def _blocks(places_mm: np.ndarray, pair: np.ndarray, truth: Truth) -> np.ndarray
 def divergence(pair: PairErrors, truth: Truth) -> float:
     """Return the rms divergence of the errors of a pair's kept vectors on their lattice.
 
-    Where the flow is free of divergence that is the divergence of the measured vectors. Differences are central.
+    Of a flow free of divergence it is the divergence of the measured vectors. Differences are central.
 
     Returns
     -------
@@ -214,22 +229,23 @@ def _rms(values: np.ndarray) -> float:
 
 
 def in_time(pairs: Sequence[PairErrors]) -> Mapping[str, float]:
-    """Return the steady and the unsteady part of the errors of three and more pairs with the same places."""
+    """Split the rms error of pairs with the same vector positions into a steady and an unsteady part.
+
+    Vectors that are scored in all pairs count. Both parts are NaN for fewer than three pairs, pairs with other
+    positions, and where no vector is scored in all pairs.
+    """
+    unknown = {"error_steady": NAN, "error_unsteady": NAN}
     first = pairs[0].positions_mm
-    same = (
-        len(pairs) >= 3
-        and len(first)
-        and all(
-            one.positions_mm.shape == first.shape and np.allclose(one.positions_mm, first, atol=1e-9) for one in pairs
-        )
-    )
-    if not same:
-        return {"error_steady": NAN, "error_unsteady": NAN}
+    if len(pairs) < 3 or not len(first):
+        return unknown
+    places = [one.positions_mm for one in pairs]
+    if not all(some.shape == first.shape and np.allclose(some, first, atol=1e-9) for some in places):
+        return unknown
     error = np.stack([np.where(one.scored[:, None], one.error, NAN) for one in pairs])
-    full = np.isfinite(error).all((0, 2))
-    if not full.any():
-        return {"error_steady": NAN, "error_unsteady": NAN}
-    error = error[:, full]
+    always = np.isfinite(error).all((0, 2))
+    if not always.any():
+        return unknown
+    error = error[:, always]
     mean = error.mean(0)
     return {
         "error_steady": _rms(np.linalg.norm(mean, axis=-1)),

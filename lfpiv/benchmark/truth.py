@@ -25,7 +25,7 @@ TRUTH = "truth"
 SLACK_VOXEL = 0.5
 """Distance by which a vector may lie outside the measurable region [voxel]: programs place windows differently."""
 SAMPLES = 40
-"""Sample points of the measurable region along its longest edge."""
+"""Sample points along the longest edge of the measurable region; at least 8 along the others."""
 FLOW, PARTICLES = "the flow", "true particles"
 """What a displacement is taken from: the flow itself, or the particles where the flow's file is missing."""
 
@@ -34,12 +34,12 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueParticles:
-    """Particles of one pair midway in time."""
+    """Particles of one pair, or of an instant and the next one, midway in time."""
 
     positions_mm: np.ndarray
     """Positions (x, y, z) [mm], shape (particle, 3)."""
     displacement_mm: np.ndarray
-    """Displacements from the first to the second frame [mm], shape (particle, 3)."""
+    """Displacements between the two frames [mm], shape (particle, 3)."""
     intensity: np.ndarray
     """Intensities relative to the mean, shape (particle,)."""
 
@@ -80,18 +80,19 @@ class Truth:
     def reference_window_mm(self) -> Point:
         """Edges (x, y, z) of the reference window, at most half of the volume's [mm].
 
-        It is that of the recommended grid. A result is scored where such a window lies in the volume.
+        It is the window of the recommended settings. The measurable region, in which a result is scored, holds the
+        centres of all such windows that lie in the volume.
         """
         x, y, z = (min(WINDOW_VOXEL * self.voxel_mm, size / 2) for size in self.scene.volume.size_mm)
         return x, y, z
 
     def inside(self, points_mm: np.ndarray, margin_windows: float = 0.0, slack_voxel: float = 0.0) -> np.ndarray:
-        """Return which points (n, 3) lie in the fluid, shape (n,).
+        """Return which points (n, 3) lie in the fluid and away from the faces of the volume, shape (n,).
 
-        They are at least `margin_windows` reference windows, less `slack_voxel`, away from the faces of the volume.
+        The least distance is `margin_windows` reference windows less `slack_voxel`; 0.5 gives the measurable region.
         """
         half = np.asarray(self.scene.volume.size_mm) / 2 - margin_windows * np.asarray(self.reference_window_mm)
-        half += (slack_voxel + 1e-6) * self.voxel_mm
+        half += (slack_voxel + 1e-6) * self.voxel_mm  # points on the limit are inside in spite of rounding
         near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half, axis=1)
         if self.scene.wall is not None:
             near[near] = ~self.scene.solid(points_mm[near])
@@ -123,7 +124,8 @@ class Truth:
         points_mm : ndarray, shape (n, 3)
             Points (x, y, z) midway in time [mm].
         window_mm : tuple of float, optional
-            Edges (x, y, z) of a window over which the displacement is averaged [mm]. Default: the value at the point.
+            Edges (x, y, z) of a window over which the displacement is averaged [mm]. Default: the value at the point;
+            where only the particles are known, the mean over the reference window.
 
         Returns
         -------
@@ -144,6 +146,7 @@ class Truth:
         return window_mean(flow, points_mm, window_mm), FLOW
 
     def _flow(self, number: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the flow as a function of points; raise InputError if its file cannot be read."""
         flow = self.scene.flow_of(number)
         flow(np.asarray([self.scene.volume.centre_mm]))  # reads the tracers' file where there is one
         return flow
@@ -156,11 +159,12 @@ class Truth:
         return float(np.nanmax(np.concatenate(lengths)))
 
     def particles(self, number: int) -> TrueParticles:
-        """Return the particles of a pair midway in time, those in the volume and around it."""
+        """Return the particles of a pair midway in time, in the volume and around it."""
         kind = f"instant_{number:06d}" if self.is_series else f"pair_{number:04d}"
         with np.load(self.folder / "particles.npz", allow_pickle=False) as stored:
             position, displacement = stored[f"{kind}_positions_mm"], stored[f"{kind}_displacement_mm"]
             intensity = stored[f"{kind}_intensity"]
+        # a series stores positions at the instant, pairs store them midway
         middle = position + displacement / 2 if self.is_series else position
         return TrueParticles(positions_mm=middle, displacement_mm=displacement, intensity=intensity)
 
@@ -176,7 +180,7 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
     Parameters
     ----------
     folder : str or Path
-        The data set, or its folder `TRUTH`.
+        The data set, or its folder `TRUTH`. With `apart` the data set.
     apart : str or Path, optional
         Folder of the truth where the data set does not hold it.
 
@@ -187,7 +191,7 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
     Raises
     ------
     InputError
-        If the folder has no truth, it is damaged, or it is that of another case.
+        If there is no truth, it is damaged, or it belongs to other images.
     """
     given = Path(folder if apart is None else apart)
     place = given if (given / "spec.json").is_file() else given / TRUTH

@@ -1,8 +1,8 @@
-"""Choose one of several networks that differ by the chance of their training only.
+"""Choose one of several networks that differ by the seed of their training only.
 
 A network whose first weights or split were unlucky can leave the true mapping between the dots or at the border of the
 board, where no held-out dot shows it. Such errors differ from network to network. So the network nearest to the others
-is taken, and the distance to them states the error of a network by itself [1]_.
+is taken, and its distance to them is an estimate of its error [1]_.
 
 References
 ----------
@@ -21,8 +21,8 @@ from lfpiv.calibration.training import Training
 from lfpiv.geometry.optics import random_on_pupil
 
 NETWORKS, MOST_NETWORKS = 3, 7
-"""Networks of a camera: the least number of which the one nearest to the others can be told, and the largest one, where
-networks scatter by more than the held-out dots show."""
+"""Least and largest number of networks that are trained for a camera. Two networks are equally far from each other, so
+one that is wrong shows among three. More are trained while they scatter by more than the held-out dots show."""
 RAYS = 2000
 """Rays on which networks are compared."""
 
@@ -32,9 +32,10 @@ class Chosen:
     """The network nearest to the others."""
 
     training: Training
+    """The network, as it was trained; an element of the sequence given."""
     scatter: float
-    """Mean distance to the other networks over the square root of 2, in units of the networks' outputs: the error that
-    the chance of the training makes, where all networks have it alike."""
+    """Error that the chance of the training makes, in the unit of the networks' outputs. It is the mean distance to the
+    other networks over the square root of 2, since both ends of a distance have errors."""
 
 
 def nearest_to_others(
@@ -45,17 +46,22 @@ def nearest_to_others(
     Parameters
     ----------
     trainings : sequence of Training
-        Networks of object point and pupil point (x, y, z, u, v) [mm], two or more.
+        Two or more networks, which map object point and pupil point (x, y, z, u, v) [mm].
     region_mm : ndarray, shape (2, 3)
         Lowest and highest corner of the box [mm].
     pupil_radius_mm : float
         Radius of the pupil [mm].
     seed : int
         Seed of the rays.
+
+    Returns
+    -------
+    Chosen
     """
     rng, (low, high) = np.random.default_rng(seed), region_mm
     rays = np.hstack([rng.uniform(low, high, (RAYS, 3)), random_on_pupil(pupil_radius_mm, RAYS, rng)])
-    places = np.stack([one.network(rays) for one in trainings])
-    distances = np.linalg.norm(places[:, None] - places, axis=-1).mean(-1).sum(1) / (len(trainings) - 1)
+    mapped = np.stack([one.network(rays) for one in trainings])
+    between = np.linalg.norm(mapped[:, None] - mapped, axis=-1).mean(-1)  # distance of each two networks, over the rays
+    distances = between.sum(1) / (len(trainings) - 1)
     best = int(distances.argmin())
     return Chosen(training=trainings[best], scatter=float(distances[best] / np.sqrt(2)))

@@ -18,9 +18,10 @@ VOXEL_ATTRIBUTES = ("sieve_voxel", "smoothing_voxel")
 EDGE = 1e-6
 """Tolerance of places at the faces of a grid [voxel]."""
 SMOOTH_VOXEL = 0.5
-"""Least standard deviation of Gaussians of which a volume is made that samples of it represent well [voxel]."""
+"""A volume that is a sum of Gaussians at least this wide is sampled; sharper volumes are integrated. Standard deviation
+[voxel]."""
 MATRICES = 6
-"""Number of matrices that are kept: those of the axes of two grids."""
+"""Number of matrices of each kind that are kept: three axes for two pairs of grids."""
 
 
 def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
@@ -67,33 +68,33 @@ def volume_on(volume: xr.DataArray, grid: Grid) -> xr.DataArray:
     (5, 4, 6)
     """
     values, given = checked_volume(volume, None, "volume")
-    if _holds(given, grid):
+    if _contains(given, grid):
         return _cut(volume, grid.within(given))
     matrix_of = _sampling if float(volume.attrs.get("sieve_voxel", 0.0)) >= SMOOTH_VOXEL else _integral
     sampling = [matrix_of(given, grid, axis) for axis in range(3)]
     ratio, nearest = grid.voxel_mm / given.voxel_mm, grid.nearest_in(given)
-    others = {str(name): about for name, about in volume.coords.items() if about.dims == AXES}
-    if any(about.attrs.get("units") == "voxel" for about in others.values()):
+    others = {str(name): coordinate for name, coordinate in volume.coords.items() if coordinate.dims == AXES}
+    if any(coordinate.attrs.get("units") == "voxel" for coordinate in others.values()):
         raise ValueError(
             "volume: expected light alone on voxels of another size, found a volume of a joint fit, with its "
             "displacement. Give the grid to `reconstruct_pair`."
         )
     dark = others[MASKED].values[nearest].astype(bool) if MASKED in others else None
     coordinates: dict[str, Any] = dict(grid.coordinates())
-    for name, about in others.items():
-        if about.dtype.kind == "f":
-            resampled = _resampled(about.values, sampling, ratio, dark)
+    for name, coordinate in others.items():
+        if coordinate.dtype.kind == "f":
+            resampled = _resampled(coordinate.values, sampling, ratio, dark)
         else:
-            resampled = np.ascontiguousarray(about.values[nearest])
-        coordinates[name] = (AXES, resampled, dict(about.attrs))
+            resampled = np.ascontiguousarray(coordinate.values[nearest])
+        coordinates[name] = (AXES, resampled, dict(coordinate.attrs))
     lengths = {name: float(volume.attrs[name]) / ratio for name in VOXEL_ATTRIBUTES if name in volume.attrs}
     edges = {"voxel_mm": grid.voxel_mm, "reconstruction_voxel_mm": given.voxel_mm}
     attributes = {**volume.attrs, **lengths, **edges}
     return xr.DataArray(_resampled(values, sampling, ratio, dark), coordinates, AXES, volume.name, attributes)
 
 
-def _holds(given: Grid, grid: Grid) -> bool:
-    """Return whether the voxels of a grid are voxels of the given one."""
+def _contains(given: Grid, grid: Grid) -> bool:
+    """Return whether each voxel of `grid` is a voxel of `given`."""
     if not math.isclose(given.voxel_mm, grid.voxel_mm, rel_tol=SPACING_TOLERANCE):
         return False
     for axis in range(3):
@@ -115,7 +116,10 @@ def _cut(volume: xr.DataArray, within: tuple[slice, slice, slice]) -> xr.DataArr
 
 
 def _resampled(values: np.ndarray, sampling: list[np.ndarray], ratio: float, dark: np.ndarray | None) -> np.ndarray:
-    """Apply the matrix of each axis, without negative values and with the light unchanged."""
+    """Apply the matrix of each axis, then make negative and `dark` voxels 0 and scale the others to the same sum.
+
+    `ratio` is the new edge of a voxel over the given edge: a voxel holds the light of its own size.
+    """
     for axis, matrix in enumerate(sampling):
         values = np.moveaxis(np.tensordot(matrix, np.asarray(values, np.float32), (1, axis)), 0, axis)
     light, positive = max(float(values.sum(dtype=np.float64)), 0.0), np.maximum(values, 0)
@@ -140,12 +144,15 @@ def _sampling(given: Grid, grid: Grid, axis: int) -> np.ndarray:
         distance = np.abs(place - (first + step))
         weight = np.where(distance < 1, 2 / 3 - distance**2 + distance**3 / 2, np.maximum(2 - distance, 0) ** 3 / 6)
         matrix[np.arange(len(place)), _mirrored(first + step, count)] += np.where(inside, weight, 0.0)
-    return _of_values(matrix)
+    return _for_values(matrix)
 
 
 @lru_cache(MATRICES)
 def _integral(given: Grid, grid: Grid, axis: int) -> np.ndarray:
-    """Return the matrix that averages the spline of one grid over the voxels of another along an axis, float32."""
+    """Return the matrix that averages the spline of one grid over the voxels of another along an axis, float32.
+
+    The part of a voxel outside the given grid counts as 0.
+    """
     count, place, edge = given.shape[axis], _place(given, grid, axis), grid.voxel_mm / given.voxel_mm
     low, high = (np.clip(place + side * edge / 2, -0.5, count - 0.5) for side in (-1, 1))
     matrix = np.zeros((len(place), count))
@@ -153,7 +160,7 @@ def _integral(given: Grid, grid: Grid, axis: int) -> np.ndarray:
     for step in range(math.ceil(edge) + 4):
         weight = (_spline_integral(high - (first + step)) - _spline_integral(low - (first + step))) / edge
         matrix[np.arange(len(place)), _mirrored(first + step, count)] += weight
-    return _of_values(matrix)
+    return _for_values(matrix)
 
 
 def _spline_integral(end: np.ndarray) -> np.ndarray:
@@ -164,8 +171,8 @@ def _spline_integral(end: np.ndarray) -> np.ndarray:
     return integral
 
 
-def _of_values(matrix: np.ndarray) -> np.ndarray:
-    """Return a matrix that applies to coefficients of the spline as one that applies to values."""
+def _for_values(matrix: np.ndarray) -> np.ndarray:
+    """Turn a matrix for the coefficients of a spline into a matrix for the values that the spline goes through."""
     count = matrix.shape[1]
     if count > 1:
         matrix = matrix @ ndimage.spline_filter1d(np.eye(count), order=3, axis=0, mode="mirror")
@@ -175,13 +182,13 @@ def _of_values(matrix: np.ndarray) -> np.ndarray:
 
 
 def _place(given: Grid, grid: Grid, axis: int) -> np.ndarray:
-    """Return the voxel centres of a grid along an axis [voxel of the given one]."""
+    """Return the voxel centres of `grid` along an axis, in voxels of `given` from the centre of its first voxel."""
     place: np.ndarray = (grid.axis_mm(axis) - given.first_centre_mm[axis]) / given.voxel_mm
     return place
 
 
 def _mirrored(index: np.ndarray, count: int) -> np.ndarray:
-    """Mirror indices of voxels about the centres of the first and the last one."""
+    """Mirror indices of voxels about the centres of the first and the last voxel."""
     period = max(2 * (count - 1), 1)
     folded = np.abs(index) % period
     mirrored: np.ndarray = np.minimum(folded, period - folded) if count > 1 else np.zeros_like(index)

@@ -18,13 +18,14 @@ from lfpiv.files import replacing, writing
 WIDTH_INCH, ROW_INCH, DPI = 9.0, 4.4, 110
 """Width of the picture and height of a camera's row [inch], and pixels per inch."""
 BRIGHT_PERCENTILE = 99.5
-"""Percentile of the light at which the grey values end."""
+"""Percentile of the image that is drawn white."""
 X_COLOUR, Y_COLOUR = "#ff5a4f", "#4fc3ff"
+"""Colours of the arrows."""
 QUESTION = (
     "Compare each picture with the real board, seen from the cameras: does x point where you count it as growing, "
     "and y up? Letters or a corner of the board must look as they do there."
 )
-LINE = 92
+LINE_LETTERS = 92
 """Letters in a line of the text above the picture."""
 
 
@@ -42,27 +43,26 @@ class BoardView:
     pitch_px: float
     """Distance of the microimages [pixel]."""
     arrows_px: np.ndarray
-    """The middle of the board, and the tips of the arrows along x and y in the recorded image (column, row) [pixel]."""
+    """Middle of the board, tips of the x and the y arrow (column, row) in the recorded image, shape (3, 2) [pixel]."""
     light: np.ndarray
-    """Image carried to the board, shape (y, x); nan where nothing is seen."""
+    """Image rectified to the plane of the board, shape (y, x); NaN where nothing is seen."""
     corner_mm: np.ndarray
-    """Place (x, y) of its first element [mm]."""
+    """Centre (x, y) of the first element of `light` [mm]."""
     bin_mm: float
-    """Distance of its elements [mm]."""
+    """Distance between the elements of `light` [mm]."""
     reach_mm: float
     """Length of the arrows [mm]."""
 
 
 def draw(views: Sequence[BoardView], said: str, path: Path) -> None:
-    """Draw the views and write them as PNG. `said` is what the picture is to be compared with."""
-    said = f"{said[0].upper()}{said[1:].rstrip('.')}"
-    text = textwrap.wrap(f"{said}. {QUESTION}", LINE)
+    """Draw the views and write them as PNG, below the text `said` (the axes, or a contradiction) and `QUESTION`."""
+    sentence = f"{said[0].upper()}{said[1:].rstrip('.')}."
+    text = textwrap.wrap(f"{sentence} {QUESTION}", LINE_LETTERS)
     head = 0.35 + 0.2 * len(text)
     figure = Figure(figsize=(WIDTH_INCH, head + ROW_INCH * len(views)), layout="constrained")
     FigureCanvasAgg(figure)
-    top, *rows = figure.subfigures(len(views) + 1, 1, height_ratios=[head, *(ROW_INCH for _ in views)], squeeze=False)[
-        :, 0
-    ]
+    heights = [head, *(ROW_INCH for _ in views)]
+    top, *rows = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     top.text(0.02, 0.5, "\n".join(text), va="center", fontsize=10)
     for row, view in zip(rows, views, strict=True):
         recorded, rectified = row.subplots(1, 2)
@@ -83,7 +83,7 @@ def _draw_recorded(axes: Axes, view: BoardView) -> None:
 
 
 def _draw_rectified(axes: Axes, view: BoardView) -> None:
-    low = view.corner_mm - view.bin_mm / 2
+    low = view.corner_mm - view.bin_mm / 2  # outer edge of the first element
     high = low + view.bin_mm * np.array(view.light.shape[::-1])
     top = float(np.nanpercentile(view.light, BRIGHT_PERCENTILE))
     axes.set_facecolor("#444444")

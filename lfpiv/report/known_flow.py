@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from lfpiv.simulation.scene import Scene
 
 MOST_COMPARED = 4_000
-"""Largest number of vectors that are compared; of more, every n-th along x and y."""
+"""About the largest number of vectors that are compared; of more, every n-th along x and y."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """Measured vectors beside the true flow, which is averaged over the windows of the correlation."""
+    """Measured vectors beside the true flow, which is averaged over the windows of the last correlation pass."""
 
     vectors: xr.Dataset
     """The measured vectors."""
@@ -43,7 +43,7 @@ class Comparison:
 
     @property
     def _inner(self) -> tuple[slice, ...]:
-        """Return the vectors without the outermost layer, whose windows have neighbours on one side only."""
+        """Return slices (z, y, x) without the outermost layer, whose windows have neighbours on one side only."""
         return tuple(slice(1, -1) if self.vectors.sizes[axis] > 2 else slice(None) for axis in AXES)
 
     @cached_property
@@ -70,7 +70,7 @@ class Comparison:
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Return the share of errors within `BAND` stated deviations of valid vectors, shape (3,); None if unknown."""
+        """Return the share of errors of valid inner vectors within `BAND` stated deviations, shape (3,), or None."""
         if "uncertainty" not in self.vectors:
             return None
         stated = np.where(self.vectors["valid"], self.vectors["uncertainty"], np.nan)[self._inner].ravel()
@@ -106,7 +106,11 @@ def compare(vectors: xr.Dataset, scene: Scene, pair: int) -> Comparison:
 
 
 def section(experiment: Experiment, vectors: Mapping[int, Path]) -> str:
-    """Return the section of a simulated experiment, as HTML; empty for another, or where its truth cannot be read."""
+    """Return the section on the first pair of a simulated experiment, as HTML.
+
+    It is empty for experiments without truth, and where no vector can be compared. Where the truth cannot be read it
+    says why.
+    """
     folder = experiment.path.parent / "truth"
     if not vectors or not (folder / "spec.json").is_file():
         return ""
@@ -130,13 +134,13 @@ def _head() -> str:
 
 
 def _thinned(vectors: xr.Dataset) -> xr.Dataset:
-    """Return every n-th vector along x and y, so many that they are compared quickly."""
+    """Return every n-th vector along x and y: about `MOST_COMPARED`, which are compared quickly."""
     step = int(np.ceil(np.sqrt(max(vectors["u"].size / MOST_COMPARED, 1))))
     return vectors.isel({axis: slice(None, None, step) for axis in "xy"})
 
 
 def _sentence(found: Comparison, name: str) -> str:
-    """State the error in voxels and as a velocity."""
+    """State the mean error and the largest true displacement, in voxels and as velocities."""
     mean, largest, voxel = float(found.length_voxel.mean()), found.largest_voxel, flow.voxel_velocity(found.vectors)
     text = (
         f"This experiment is simulated, so its flow is known. The vectors of {name} are off by {number(mean, 2)} voxel "

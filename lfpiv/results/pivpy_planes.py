@@ -15,7 +15,7 @@ from lfpiv.results.stacked_files import INSTANT, TIME_ATTRIBUTES
 from lfpiv.velocity import derived
 
 VARIABLES = ("u", "v", "w", "valid", "masked")
-"""Variables of the vectors that a plane holds."""
+"""Variables of the vector files that go into a plane; an export names all others as left out."""
 
 _MM_PER_M = 1000.0
 
@@ -43,15 +43,16 @@ def write_planes(
     times : ndarray
         Time of each pair or instant [s], or the number of the pair where the interval is not known.
     known_interval : bool
-        Whether the times of pairs are in seconds.
+        Whether the times of pairs are in seconds. Times of instants always are.
     files : sequence of str
-        Names of the files of vectors.
+        Names of the vector files, which each plane states as an attribute.
     progress : callable
         Called with the finished fraction.
 
     Returns
     -------
     list of Path
+        The files, in the order of `depths`.
     """
     written = []
     for number, depth in enumerate(depths):
@@ -64,11 +65,11 @@ def write_planes(
 
 
 def _plane(results: xr.Dataset, times: np.ndarray, known_interval: bool, files: Sequence[str]) -> xr.Dataset:
-    """Return one plane of vectors in pivpy's form: dims y, x, t, velocities in mm/s because lengths are in mm."""
+    """Return one plane of vectors in pivpy's form: dimensions y, x, t; velocities in mm/s, as lengths in mm."""
     dims, along = ("y", "x", "t"), next(str(name) for name in results.dims if name not in ("y", "x"))
-    names = {"u": "u", "v": "v", "w": "velocity_z"}  # pivpy keeps derived scalars in w
+    variable_of = {"u": "u", "v": "v", "w": "velocity_z"}  # pivpy keeps derived scalars in w
     variables: dict[str, Any] = {}
-    for name, variable in names.items():
+    for name, variable in variable_of.items():
         values = results[name].transpose("y", "x", along).values.astype(float) * _MM_PER_M
         standard = {"standard_name": f"{name}_velocity"} if name == variable else {}
         text = f"velocity along {derived.COMPONENTS[name]}"

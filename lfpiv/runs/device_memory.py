@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed:
     """Estimate the memory that a process needs on a GPU from the nominal rig, before any image is read.
 
-    Without `weights` no volume is reconstructed.
+    Without `weights` no volume is reconstructed, and the memory of the weights is left out.
     """
     from lfpiv.weights.checks import estimate_device_need
 
@@ -33,18 +33,18 @@ def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing
     Parameters
     ----------
     experiment : Experiment
-        With the grid that is reconstructed.
+        Experiment with the grid that is reconstructed.
     need : DeviceNeed
-        Of one process.
+        Memory that one process needs.
     device : Device
-        Where the kernels run; a run on the CPU passes.
+        The running device, which the message names. Its free memory is asked of `runtime`; a run on the CPU passes.
     sharing : int
         Number of processes that share a GPU.
 
     Raises
     ------
     InputError
-        With the memory that is needed and that is free, and what to change.
+        If the memory does not suffice. The message states the need, the free memory, and what to change.
     """
     free = runtime.free_bytes()
     if free is not None and sharing * need.whole > free:

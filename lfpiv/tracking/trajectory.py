@@ -1,10 +1,10 @@
 """Position, velocity and acceleration along tracks: a filter that predicts a particle, and the fit to its whole track.
 
-The acceleration of a particle is a stationary random process that forgets itself exponentially, that of Singer [1]_, of
-one strength and memory for all tracks. Positions are measured with known standard errors. For these two the Kalman
+The acceleration of a particle is a stationary random process whose correlation decays exponentially, as of Singer [1]_.
+All tracks share its strength and memory. Positions are measured with known standard errors. With this model the Kalman
 filter gives the best prediction from the past, and the smoother of Rauch, Tung and Striebel [2]_ the best estimate from
-the whole track: a Wiener filter that knows about ends, gaps, and unlike errors. Strength, memory, and the factor on the
-standard errors are those that make the measured tracks most likely.
+the whole track: a Wiener filter that knows about ends, gaps, and unequal errors. `fit_motion` fits strength, memory,
+and a factor on the standard errors to the measured tracks by their likelihood.
 
 Lengths are in voxels and times in instants. The axes are independent of each other.
 
@@ -29,27 +29,27 @@ FIRST_ACCELERATION = 0.5
 FIRST_MEMORY = 5.0
 """Memory of the acceleration before tracks show it [instant]."""
 ACCELERATIONS, MEMORIES, FACTORS = (1e-4, 2.0), (1.0, 30.0), (1.0, 10.0)
-"""Limits of the three figures that tracks show. Positions are never surer than their images say: errors of most may be
-smaller, but those of particles that overlap are not."""
+"""Limits of the three figures that are fitted. The factor is at least 1: most positions may be better than stated, but
+particles that overlap are not."""
 DIFFUSE_SPEED = 10.0
 """Standard deviation of a velocity that is not known [voxel/instant]."""
 TELLING_TRACKS, TELLING_INSTANTS = 300, 40
-"""Largest number of tracks, and of measured positions of each, that the motion is fitted to."""
+"""Largest number of tracks that callers give to `fit_motion`, and of measured positions of each track that it takes."""
 TELLING_LENGTH = 4
 """Least number of positions of a track that tells the motion."""
 LEAST_TELLING = 5
 """Least number of such tracks."""
 TAILS = 8.0
-"""Degrees of freedom of Student's distribution that innovations have: some positions are mixed up with others."""
+"""Degrees of freedom of Student's distribution of innovations. Its tails allow for positions of other particles."""
 FIT_STEPS = 120
 """Largest number of steps of the fit of the motion along an axis."""
 FIRST_RATIO = 1.6
-"""Ratio of the figures that the fit compares first."""
+"""Ratio between the first guess of a figure and the other value that the fit tries first."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How particles move, for each axis (x, y, z)."""
+    """How particles move, for each axis (x, y, z), or for the only axis of a fit."""
 
     acceleration: tuple[float, ...] = (FIRST_ACCELERATION,) * 3
     """Standard deviation of the acceleration [voxel/instant^2]."""
@@ -59,16 +59,19 @@ class Motion:
     """Errors of positions over their stated standard errors."""
 
     def steps(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return transition and variance that it adds, shape (track, axis, 3, 3), for times (track,) [instant]."""
-        several, which = np.unique(times, return_inverse=True)
-        found = [_step(self, float(one)) for one in several]
+        """Return transition matrices and added covariances, shape (track, axis, 3, 3), over times (track,)."""
+        different, which = np.unique(times, return_inverse=True)
+        found = [_step(self, float(time)) for time in different]
         moved, added = (np.stack([one[part] for one in found]) for part in (0, 1))
         return moved[which], added[which]
 
 
 @lru_cache(maxsize=1024)
 def _step(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return transition and added variance (axis, 3, 3) over a time, by the exponential of Van Loan (1978)."""
+    """Return transition and added covariance (axis, 3, 3) over a time by the matrix exponential of Van Loan (1978).
+
+    The exponential of [[-F, Q], [0, F^T]] t is [[., G], [0, T^T]]: T is the transition, and T G the added covariance.
+    """
     axes = len(motion.memory)
     rate, density = np.zeros((axes, 3, 3)), np.zeros((axes, 3, 3))
     rate[:, 0, 1] = rate[:, 1, 2] = 1
@@ -83,10 +86,10 @@ def _step(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class State:
-    """Position, velocity and acceleration of tracks at one time."""
+    """Estimates of position, velocity and acceleration of tracks, each at its own time, with their covariance."""
 
     mean: np.ndarray
-    """Shape (track, axis, 3) [voxel, voxel/instant, voxel/instant^2]."""
+    """Position, velocity, acceleration, shape (track, axis, 3) [voxel, voxel/instant, voxel/instant^2]."""
     variance: np.ndarray
     """Covariance, shape (track, axis, 3, 3)."""
 
@@ -112,22 +115,22 @@ class State:
         return State(self.mean[chosen], self.variance[chosen])
 
     def joined(self, other: State) -> State:
-        """Return the states of these tracks and of others."""
+        """Return the states of these tracks, then of other tracks."""
         return State(np.concatenate([self.mean, other.mean]), np.concatenate([self.variance, other.variance]))
 
     def where(self, chosen: np.ndarray, other: State) -> State:
-        """Return the states of another one for chosen tracks, shape (track,), bool."""
+        """Return these states, but `other` for chosen tracks, shape (track,), bool."""
         mean = np.where(chosen[:, None, None], other.mean, self.mean)
         return State(mean, np.where(chosen[:, None, None, None], other.variance, self.variance))
 
     def after(self, motion: Motion, times: np.ndarray) -> State:
-        """Return the states after times (track,) [instant]."""
+        """Predict the states after times (track,) [instant]."""
         moved, added = motion.steps(times)
         mean = np.einsum("taij,taj->tai", moved, self.mean)
         return State(mean, moved @ self.variance @ moved.swapaxes(2, 3) + added)
 
     def measured(self, motion: Motion, position: np.ndarray, error: np.ndarray) -> State:
-        """Return the states that measured positions (track, axis) with standard errors [voxel] correct."""
+        """Return the states corrected by measured positions (track, axis) with standard errors [voxel]."""
         noise = np.square(error * motion.factor)
         gain = self.variance[..., 0] / (self.variance[..., 0, 0] + noise)[..., None]
         mean = self.mean + gain * (position - self.mean[..., 0])[..., None]
@@ -138,10 +141,10 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Measured positions of tracks, one after the other; shorter tracks are filled up at their end."""
+    """Measured positions of tracks, one row a track. Shorter tracks repeat their last position, see `there`."""
 
     time: np.ndarray
-    """Shape (track, position) [instant], rising."""
+    """Shape (track, position) [instant], rising along a track until its end."""
     position: np.ndarray
     """Shape (track, position, axis) [voxel]."""
     error: np.ndarray
@@ -151,7 +154,7 @@ class Measured:
 
     @classmethod
     def of(cls, track: np.ndarray, time: np.ndarray, position: np.ndarray, error: np.ndarray) -> Measured:
-        """Gather rows (row,) and (row, axis), ordered by track and then by time; tracks are numbered from 0."""
+        """Gather rows (row,) and (row, axis) in the order of track, then time; tracks are 0, 1, ... without gaps."""
         length = np.bincount(track) if len(track) else np.zeros(0, int)
         first = np.concatenate([[0], np.cumsum(length)[:-1]]) if len(length) else length
         place = np.minimum(np.arange(length.max(initial=0)), length[:, None] - 1) + first[:, None]
@@ -159,7 +162,7 @@ class Measured:
 
     @property
     def there(self) -> np.ndarray:
-        """Positions that were measured, shape (track, position), bool."""
+        """Positions that were measured, not repeated to fill a row, shape (track, position), bool."""
         found: np.ndarray = np.arange(self.time.shape[1]) < self.length[:, None]
         return found
 
@@ -178,7 +181,7 @@ def smooth(motion: Motion, measured: Measured) -> State:
     Returns
     -------
     State
-        Shapes (track, position, axis, 3) and (track, position, axis, 3, 3).
+        Shapes (track, position, axis, 3) and (track, position, axis, 3, 3). Behind the end of a track its last state.
     """
     count = measured.time.shape[1]
     if not count:
@@ -216,7 +219,8 @@ def _inverse(variance: np.ndarray) -> np.ndarray:
 def unlikeliness(motion: Motion, measured: Measured) -> np.ndarray:
     """Return the negative logarithm of the likelihood of each axis, shape (axis,), but for a constant.
 
-    The first two positions of a track tell its velocity and do not count.
+    Innovations over their standard deviation follow Student's distribution with `TAILS` degrees of freedom. The first
+    two positions of a track tell its velocity and do not count.
     """
     state = State.first(motion, measured.position[:, 0], measured.error[:, 0])
     there, total = measured.there, np.zeros(measured.position.shape[2])
@@ -253,6 +257,7 @@ def fit_motion(measured: Measured, start: Motion) -> Motion:
 
         first = np.log([start.acceleration[axis], start.memory[axis], start.factor[axis]])
         first = np.clip(first, *limits.T)
+        # the simplex needs a second value of each figure, within the limits
         away = np.where(first + np.log(FIRST_RATIO) < limits[:, 1], 1, -1) * np.log(FIRST_RATIO)
         found = minimize(
             cost,
@@ -272,6 +277,6 @@ def fit_motion(measured: Measured, start: Motion) -> Motion:
 
 
 def _motion_of(logs: np.ndarray) -> Motion:
-    """Return the motion along one axis with the logarithms of its figures."""
+    """Return the motion along one axis from the logarithms of acceleration, memory and factor."""
     acceleration, memory, factor = np.exp(logs)
     return Motion((float(acceleration),), (float(memory),), (float(factor),))

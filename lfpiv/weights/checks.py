@@ -1,4 +1,4 @@
-"""How much memory the weights of a grid will need, and how far built weights are from counted rays."""
+"""Estimate the memory of the weights of a grid before they are built, and compare built weights with counted rays."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 def estimate_memory(calibration: Calibration, grid: Grid, form: str = "auto", particle_voxel: float = 0.0) -> int:
     """Estimate the memory that the weights of a grid will need [byte], from a sample of its voxels.
 
-    Nothing large is allocated. The form "auto" is taken for profiles if the microlens layout is square.
+    Nothing large is allocated. "auto" counts no rays here: it means profiles for square microlens layouts, else pixels.
     """
     forms = _forms(calibration, grid, form, particle_voxel)
     return sum(one.host_bytes(name) for name, one in forms.items())
 
 
 def estimate_device_need(calibration: Calibration, grid: Grid, form: str = "auto") -> DeviceNeed:
-    """Do as `estimate_memory` for the memory of a GPU, volumes, images and correlation included."""
+    """Estimate the memory of a process on a GPU: weights as `estimate_memory`, volumes, images and correlation."""
     sizes = tuple(one.device_bytes(name) for name, one in _forms(calibration, grid, form).items())
     return DeviceNeed(sizes, beside_bytes(calibration.cameras.values(), grid))
 
 
 def _forms(calibration: Calibration, grid: Grid, form: str, particle_voxel: float = 0.0) -> dict[str, Form]:
-    """Return the form that suits each camera, without counted rays."""
-    runtime.device()
+    """Return the form that suits each camera, chosen without counting rays."""
+    runtime.device()  # `MemoryLeft` knows the free memory of a running device only
     cameras, choices = calibration.cameras, {}
     for name, camera in cameras.items():
         own = "profiles" if camera.lattice.layout == "square" else "pixels"
@@ -47,7 +47,7 @@ def _forms(calibration: Calibration, grid: Grid, form: str, particle_voxel: floa
 def compare_with_count(weights: Weights) -> dict[str, list[float]]:
     """Compare weights with counted rays in a few random voxels of every camera.
 
-    Warn of weights whose error exceeds the aim, unless `choose_forms` did so before.
+    Warn of footprints whose error exceeds the aim. Cameras for which `choose_forms` counted rays were warned of there.
 
     Returns
     -------

@@ -1,4 +1,7 @@
-"""Volumes in which some voxels hold no fluid: what both hold in common, and their intensities less the local mean."""
+"""Volumes with solid voxels: find the fluid that two volumes share, and subtract the local mean of the fluid.
+
+A function for arrays of either kind returns arrays on the GPU for arrays on the GPU, else of NumPy.
+"""
 
 import numpy as np
 import warp as wp
@@ -15,7 +18,7 @@ TINY = float(np.finfo(np.float32).tiny)
 
 
 def flags_on_device(flags: Values) -> wp.array:
-    """Return flags of voxels on the running device; nothing is moved if they are there."""
+    """Return flags of voxels on the running device, as they are if they are there already."""
     return flags if isinstance(flags, wp.array) else to_device(np.ascontiguousarray(flags, bool), wp.bool)
 
 
@@ -42,8 +45,9 @@ def as_numbers(flags: Given) -> Given:
 def common_fluid(first: Given, second: Given) -> Given:
     """Return the voxels that hold fluid in both volumes, flags of shape (z, y, x).
 
-    Where the two solids differ, the flow carries particles across the wall. One volume then shows particles cut by the
-    edge of the other. So voxels beside the difference are left out too.
+    Both volumes are deformed by a predicted field. Where their solids then differ, the field carries particles across
+    the wall: one volume shows particles cut by the edge of the other. So the face neighbours of voxels that differ are
+    left out too.
 
     Parameters
     ----------
@@ -65,14 +69,14 @@ def common_fluid(first: Given, second: Given) -> Given:
 def levelled(first: Given, second: Given, fluid: Values, window: Triple) -> tuple[Given, Given]:
     """Return both volumes less the local mean of their fluid, 0 where either of them holds none.
 
-    The coefficient of volumes whose local mean is 0 needs no mean over the fluid of each window at each lag. Their
-    edges do not correlate with each other. The mean is that over a window around each voxel.
+    The mean is taken over the fluid in a window around each voxel. Without it the edges of the fluid would correlate
+    with each other, or the correlation would need the mean of each window's fluid at each lag.
 
     Parameters
     ----------
     first, second : array, shape (z, y, x), float32
     fluid : array of bool, shape (z, y, x)
-        From `common_fluid`.
+        Voxels that hold fluid in both volumes, such as from `common_fluid`.
     window : tuple of int
         Edges, order (z, y, x) [voxel].
     """
@@ -82,7 +86,7 @@ def levelled(first: Given, second: Given, fluid: Values, window: Triple) -> tupl
         levels = [_levelled(on_device(volume), flags, share, window) for volume in (first, second)]
     else:
         inside = to_host(fluid)
-        share = np.maximum(_local_mean(inside.astype(np.float32), window), np.finfo(np.float32).tiny)
+        share = np.maximum(_local_mean(inside.astype(np.float32), window), np.float32(TINY))
         levels = [
             np.where(inside, volume - _local_mean(np.where(inside, volume, 0), window) / share, 0).astype(np.float32)
             for volume in map(to_host, (first, second))
@@ -91,6 +95,7 @@ def levelled(first: Given, second: Given, fluid: Values, window: Triple) -> tupl
 
 
 def _levelled(volume: wp.array, fluid: wp.array, share: wp.array, window: Triple) -> wp.array:
+    """Return a volume less the local mean of its fluid, on a GPU; `share` is the local mean of the flags."""
     inside, level = empty_volume(volume.shape), empty_volume(volume.shape)
     voxelwise_gpu.run(voxelwise_gpu._in_fluid, [volume, fluid], inside)
     mean = filters_gpu.local_mean(inside, window, filters_gpu.ZEROS)
@@ -99,4 +104,5 @@ def _levelled(volume: wp.array, fluid: wp.array, share: wp.array, window: Triple
 
 
 def _local_mean(values: np.ndarray, window: Triple) -> np.ndarray:
+    """Return the mean over a window, which is 0 outside the volume."""
     return ndimage.uniform_filter(values, window, mode="constant")

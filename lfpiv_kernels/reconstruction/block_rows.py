@@ -1,8 +1,9 @@
 """Warp: blocks of weights cut into rows of rays, so that a set of rows of pixels under every lens can be taken alone.
 
 A row has the levels of `BLOCK_WIDTH` rays side by side; zeros fill it up. The rows of a set lie one after the other,
-voxel by voxel, so that a projection by one set reads no memory of the others. Beside the blocks they take some two
-times the memory of these. The loops are C++, see ``projector.h``. A GPU has no rows. Twin: ``reference.dense``.
+voxel by voxel, so that a projection by one set reads no memory of the others. They take about twice the
+memory of the blocks, which are kept as well. The loops are C++, see ``projector.h``. A GPU has no rows.
+Twin: ``reference.dense``.
 """
 
 from dataclasses import replace
@@ -19,7 +20,7 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
 wp.set_module_options(native.options("projector.h"))
 
 ROW_BYTES = 4 + BLOCK_WIDTH
-"""Memory of a row [byte]."""
+"""Memory of a row: the index of its first ray, and its levels [byte]."""
 
 
 @wp.struct
@@ -111,7 +112,10 @@ def _project(
 
 
 def with_rows(blocks: Blocks, sets: int) -> Blocks:
-    """Return blocks of the form "pixels" with their rows of rays: every `sets`-th row under each lens makes a set."""
+    """Return blocks of the form "pixels" with their rows of rays: every `sets`-th row under each lens makes a set.
+
+    The arrays on the device "cpu" are views of the NumPy arrays. So the kernels fill `first`, `ray` and `level`.
+    """
     voxels = len(blocks.scale)
     split = SplitBlocks()
     for name in ("first_block", "first_value", "ray", "height", "width"):
@@ -120,7 +124,7 @@ def with_rows(blocks: Blocks, sets: int) -> Blocks:
     split.edge, split.sets, split.voxels = blocks.microimages.edge, sets, voxels
     first = np.zeros(sets * voxels + 1, np.int32)
     launch(Call(_count, voxels, [split], [to_device(first[1:], device="cpu")]), device="cpu")
-    np.cumsum(first, out=first)
+    np.cumsum(first, out=first)  # from numbers of rows to the index of the first row
     ray, level = np.empty(first[-1], np.int32), np.zeros(BLOCK_WIDTH * first[-1], np.uint8)
     outputs = [to_device(array, device="cpu") for array in (first[:-1].copy(), ray, level)]
     launch(Call(_write, voxels, [split], outputs), device="cpu")
@@ -128,7 +132,7 @@ def with_rows(blocks: Blocks, sets: int) -> Blocks:
 
 
 class RowLoops:
-    """Projection and back projection by the rows of one set, for a part of the voxels, on the CPU."""
+    """Projection and back projection by the rows of one set, for the voxels first <= voxel < last, on the CPU."""
 
     def __init__(self, rows: BlockRows, scale: np.ndarray):
         self._rows = Rows()
@@ -136,16 +140,16 @@ class RowLoops:
             setattr(self._rows, name, to_device(getattr(rows, name)))
         self._rows.level, self._rows.scale = bytes_on_device(rows.level), to_device(scale)
         self._rows.voxels = len(scale)
-        load(_project, "cpu")  # before threads start
+        load(_project, "cpu")  # with the whole module, before threads start
 
     def scatter(self, volume: wp.array, ray_set: int, first: int, last: int, rays_out: wp.array) -> None:
-        """Add the light of the voxels from `first` to `last` to their rays of a set."""
+        """Project: add the weighted intensities of the voxels to their rays of a set."""
         inputs = [self._rows, volume, ray_set, first]
         wp.launch(_project, dim=last - first, inputs=inputs, outputs=[rays_out], device="cpu")
 
     def gather(
         self, rays: wp.array, active: wp.array, ray_set: int, first: int, last: int, volume_out: wp.array
     ) -> None:
-        """Add the weighted sum of the light on their rays of a set to the active voxels from `first` to `last`."""
+        """Back-project: add the weighted sum of their rays of a set to the voxels where `active` is not 0."""
         inputs = [self._rows, rays, active, ray_set, first]
         wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume_out], device="cpu")

@@ -1,4 +1,4 @@
-"""Find the lattice of a board in one plane with the nominal pose: the first dots that are known."""
+"""Find the first dots of a board: its lattice in one plane, rectified with the nominal pose."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import Blobs, CameraPose, Rectified, Rectifier
 
 FIRST_PLANES = 3
-"""Planes that are searched for the lattice with the nominal pose."""
+"""Least number of planes that are searched with the nominal pose; further planes while none is regular."""
 
-_REGULAR = 0.5  # least share of the strongest blobs on one lattice
-_PEAK_SPACINGS = 0.4  # distance between blobs of the first lattice
-_INLIER_SPACINGS = 0.2  # largest distance of a blob from its site on the first lattice
+_REGULAR = 0.5  # least `FirstLattice.share` of a board; random blobs reach less
+_PEAK_SPACINGS = 0.4  # least distance between two blobs [spacing]
+_INLIER_SPACINGS = 0.2  # largest distance of a blob from its site [spacing]
 
 
 @dataclass(frozen=True, eq=False)
 class FirstLattice:
-    """The lattice that one plane shows with the nominal pose."""
+    """The lattice that one plane shows when it is rectified with a pose."""
 
     points_mm: np.ndarray
-    """Board points of the dots, shape (d, 3) [mm]."""
+    """Points of the board at which the dots are stated, shape (d, 3) [mm]."""
     chief_mm: np.ndarray
-    """Their chief rays on the array, shape (d, 2) [mm]."""
+    """Where the chief rays of the dots, as seen, meet the microlens array, shape (d, 2) [mm]."""
     sign: int
     """+1 for bright dots, -1 for dark ones."""
     score: float
-    """Sum of their contrasts."""
+    """Sum of the dots' contrasts."""
     share: float
     """Share of the strongest blobs, as many as the board has dots, on one lattice."""
 
@@ -40,7 +40,10 @@ class FirstLattice:
 
 
 def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose) -> FirstLattice:
-    """Find the lattice with the nominal pose in one of the planes nearest to z = 0."""
+    """Find the lattice in one of the planes nearest to z = 0, rectified with the pose `plan`.
+
+    If no plane shows a regular lattice, the lattice returned is not `regular` either.
+    """
     order = planes_from_middle(board)
     found: list[FirstLattice] = []
     for plane in order:
@@ -59,7 +62,7 @@ def planes_from_middle(board: DotBoard) -> np.ndarray:
 
 
 def lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
-    """Match the lattice to the blobs of a plane, bright or dark ones."""
+    """Match the lattice to the blobs of a plane, either bright or dark; without a match it has no dots and score 0."""
     best = FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
     for sign in (1, -1):
         blobs = rectified.peaks(_PEAK_SPACINGS * board.spacing_mm, sign)
@@ -88,7 +91,8 @@ class _LatticeMatch:
 def _match_lattice(blobs: Blobs, board: DotBoard) -> _LatticeMatch:
     """Find the lattice in a cloud of blobs that may lack dots and contain others.
 
-    The board's middle is the admissible lattice site nearest to the origin.
+    The stated pose is taken to be right within half a spacing: the middle of the board is the lattice site nearest to
+    the origin, or the middle between sites where `board.dots` is even.
     """
     peaks, contrast = blobs.position_mm, blobs.contrast
     if len(peaks) < 1:
@@ -109,7 +113,7 @@ def _match_lattice(blobs: Blobs, board: DotBoard) -> _LatticeMatch:
     index += np.rint(middle + phase).astype(int)  # the origin's site is -phase
     regular = np.hypot(*(site - np.rint(site)).T) < _INLIER_SPACINGS
     member = np.flatnonzero(((index >= 0) & (index < board.dots)).all(1) & regular)
-    member = member[np.argsort(-contrast[member], kind="stable")]  # the stronger of two blobs at one site
+    member = member[np.argsort(-contrast[member], kind="stable")]  # so `unique` keeps the strongest blob of a site
     _, first = np.unique(index[member], axis=0, return_index=True)
     member = np.sort(member[first])
     return _LatticeMatch(index[member], member, regular)
@@ -118,7 +122,8 @@ def _match_lattice(blobs: Blobs, board: DotBoard) -> _LatticeMatch:
 def _lattice_waves(blobs: Blobs, board: DotBoard) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix and phase of site = matrix @ position - phase: the plane waves that fit the blobs best.
 
-    The wave vectors are searched near (1, 0) and (0, 1) per spacing.
+    A wave has its crests on the columns, or rows, of the lattice. The wave vectors are searched near (1, 0) and (0, 1)
+    per spacing, and the nearest are preferred. A direction with a single dot takes the stated spacing.
     """
     weight = np.minimum(blobs.contrast, 3 * np.median(blobs.contrast))
     size, turn = np.meshgrid(np.linspace(0.75, 1.35, 61), np.radians(np.linspace(-9, 9, 37)), indexing="ij")

@@ -2,8 +2,8 @@
 
 The text behind ``#`` names a dataset, an image in it, or both: ``run.h5#images[12]`` or ``run.h5#images/12`` is image
 12 of a dataset of three dimensions (image, row, column), ``run.h5#images/00012`` a dataset of two dimensions,
-``run.h5#12`` image 12 of the file's only dataset of images. What stands in other files is refused: external links and
-storage, and virtual datasets.
+``run.h5#12`` image 12 of the file's only dataset of images. Pixels in other files are refused: external links,
+external storage and virtual datasets.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LAST = re.compile(r"(?P<name>.+)/(?P<number>\d{1,18})")
 
 
 class Hdf5Images:
-    """An HDF5 file that stays open."""
+    """An HDF5 file that stays open as long as this object lives: hold it while a dataset of it is read."""
 
     def __init__(self, image: ImagePath):
         self._file = h5py.File(image.file, "r")
@@ -39,7 +39,8 @@ class Hdf5Images:
     def find(self, part: str) -> tuple[h5py.Dataset, int | None]:
         """Return the dataset that the text behind ``#`` names, and the number of the image in it.
 
-        The number is None for a dataset of two dimensions.
+        The number is None for a dataset of two dimensions. Brackets always hold a number. Other digits are read as a
+        number only if no dataset has that name.
         """
         name, number = part, None
         if match := _INDEXED.fullmatch(part):
@@ -61,7 +62,7 @@ class Hdf5Images:
 
     @staticmethod
     def _number(dataset: h5py.Dataset, number: int | None) -> int | None:
-        """Return the number of the image in a dataset; refuse a dataset of other than images."""
+        """Return the number of the image in a dataset, 0 if a stack of one needs none; refuse what holds no images."""
         shape: tuple[int, ...] = dataset.shape or ()
         name = dataset.name.lstrip("/")
         if len(shape) == 2:
@@ -81,7 +82,7 @@ class Hdf5Images:
         group, names, links = self._file, [part for part in name.split("/") if part], 0
         while names:
             first = names.pop(0)
-            if not group.id.links.exists(first.encode()):  # follows no link
+            if not group.id.links.exists(first.encode()):  # unlike `in`, it does not follow the link
                 return None
             link = group.get(first, getlink=True)
             if isinstance(link, h5py.SoftLink):
@@ -128,19 +129,19 @@ _open_files: OpenFiles[Hdf5Images] = OpenFiles(OPEN_STACKS)
 
 def header(image: ImagePath) -> Header:
     """Return the header of an image without reading its pixels."""
-    opened = _open_files.get(image, Hdf5Images)  # named, so that it stays open here
+    opened = _open_files.get(image, Hdf5Images)  # a name keeps the file open until the header is read
     return _checked(*opened.find(image.part))
 
 
 def in_order(image: ImagePath) -> bool:
-    """Return whether an image is one of a dataset of images, all written: they are numbered from 0 without gaps."""
+    """Return whether all numbers of images from 0 exist: the image is in a stack, of which all images were written."""
     opened = _open_files.get(image, Hdf5Images)
     dataset, number = opened.find(image.part)
     return number is not None and (dataset.chunks is None or all_written(dataset))
 
 
 def recorded(image: ImagePath) -> Recorded:
-    """Return when an image was recorded: HDF5 has no place of its own for it."""
+    """Return an empty record: HDF5 has no standard place for the time at which an image was recorded."""
     return Recorded()
 
 
@@ -156,7 +157,10 @@ def read(image: ImagePath) -> np.ndarray:
 
 
 def _checked(dataset: h5py.Dataset, number: int | None) -> Header:
-    """Return the header of an image; refuse pixels in other files, never written, or more than what is stored."""
+    """Return the header of an image.
+
+    Refuse pixels in other files, pixels that were never written, and sizes that the stored bytes cannot make.
+    """
     settings = dataset.id.get_create_plist()
     if dataset.is_virtual or settings.get_external_count():
         raise NotOneImage(f"a dataset {dataset.name} whose pixels are in another file; copy them into this one")

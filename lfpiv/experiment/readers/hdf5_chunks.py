@@ -1,8 +1,8 @@
 """Read images of HDF5 datasets that are stored in chunks, which may be missing, compressed, or made to inflate.
 
 HDF5 reads chunks that were never written as zeros, and decodes a compressed chunk to whatever size it grows to. So
-chunks are looked up first, those of deflate are decoded here up to their declared size, and the sizes that chunks of
-other filters state about themselves are compared with it.
+chunks are looked up first, and decoded here, up to their declared size. Chunks of szip, n-bit and scale-offset are left
+to HDF5: the last two cannot inflate, and the size that a chunk of szip states is compared with the declared size.
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ import numpy as np
 
 from lfpiv.experiment.readers.source import NoSuchImage, NotOneImage
 
-SHUFFLE, FLETCHER, SZIP, BITSHUFFLE = 2, 3, 4, 32008
-OWN_FILTERS = (SHUFFLE, FLETCHER, SZIP, 5, 6)
-"""Filters of HDF5 itself that cannot inflate, n-bit (5) and scale-offset (6) included; szip states its size."""
+SHUFFLE, FLETCHER, SZIP, NBIT, SCALE_OFFSET, BITSHUFFLE = 2, 3, 4, 5, 6, 32008
+"""Registered numbers of filters."""
+BY_HDF5 = frozenset({SZIP, NBIT, SCALE_OFFSET})
+"""Filters that HDF5 decodes."""
+OWN_FILTERS = (SHUFFLE, FLETCHER, *BY_HDF5)
+"""Filters of HDF5 itself but deflate. They cannot inflate, szip apart, which states its size."""
 DECODERS: dict[int, Callable[..., bytes | bytearray]] = {
     1: imagecodecs.zlib_decode,
     32000: imagecodecs.lzf_decode,
@@ -59,14 +62,14 @@ def require_written(dataset: h5py.Dataset, number: int | None) -> None:
 def read_chunks(dataset: h5py.Dataset, number: int | None) -> np.ndarray:
     """Return the pixels of an image; raise ValueError for a chunk that grows beyond its declared size."""
     filters, size = _filters(dataset), math.prod(dataset.chunks) * dataset.dtype.itemsize
-    if {one for one, _, _ in filters} & {SZIP, 5, 6}:
+    if {one for one, _, _ in filters} & BY_HDF5:
         return _by_hdf5(dataset, number, size)
     image = np.empty(dataset.shape[-2:], dataset.dtype)
     rows, columns = dataset.chunks[-2:]
     for start in _starts(dataset, number):
         mask, stored = dataset.id.read_direct_chunk(start)
         for at in reversed(range(len(filters))):
-            if not mask >> at & 1:
+            if not mask >> at & 1:  # a bit of the mask is set where the filter was skipped for this chunk
                 stored = _undone(stored, *filters[at][:2], dataset.dtype.itemsize, size)
         if len(stored) != size:
             raise ValueError(f"a chunk holds {len(stored)} bytes of pixels, expected {size}")
@@ -78,7 +81,7 @@ def read_chunks(dataset: h5py.Dataset, number: int | None) -> np.ndarray:
 
 
 def _by_hdf5(dataset: h5py.Dataset, number: int | None, size: int) -> np.ndarray:
-    """Return an image that HDF5 decodes, where no chunk states more bytes than it should hold."""
+    """Return an image that HDF5 decodes; raise ValueError for a chunk of szip that states more than `size` bytes."""
     filters = _filters(dataset)
     if {one for one, _, _ in filters} - set(OWN_FILTERS):
         raise NotOneImage(f"a dataset {dataset.name} behind two filters that compress; write the images with gzip")
@@ -91,7 +94,7 @@ def _by_hdf5(dataset: h5py.Dataset, number: int | None, size: int) -> np.ndarray
 
 
 def _undone(stored: bytes, number: int, values: tuple[int, ...], item_bytes: int, size: int) -> bytes:
-    """Return the bytes of a chunk before a filter was applied, of which there may be `size` and a checksum."""
+    """Undo one filter of a chunk. Decoders return at most the `size` bytes of its pixels and a checksum."""
     if number == SHUFFLE:
         return _bytes_in_order(stored, item_bytes)
     if number == FLETCHER:
@@ -100,11 +103,11 @@ def _undone(stored: bytes, number: int, values: tuple[int, ...], item_bytes: int
         return stored[:-4]
     if number == BITSHUFFLE:
         return _bits_in_order(stored, values, item_bytes, size)
-    return bytes(DECODERS[number](stored, out=size + 4))  # 4 bytes of a checksum that was added before
+    return bytes(DECODERS[number](stored, out=size + 4))  # 4 bytes: Fletcher-32 may come before the compression
 
 
 def _bytes_in_order(stored: bytes, item_bytes: int) -> bytes:
-    """Return the pixels of a chunk in which the first bytes of all pixels come first, then the second ones."""
+    """Undo shuffle: the first bytes of all pixels come first, then all second bytes, and so on."""
     count = len(stored) // item_bytes
     pixels = np.empty((count, item_bytes), np.uint8)
     planes = np.frombuffer(stored, np.uint8, count * item_bytes).reshape(item_bytes, count)
@@ -114,7 +117,11 @@ def _bytes_in_order(stored: bytes, item_bytes: int) -> bytes:
 
 
 def _bits_in_order(stored: bytes, values: tuple[int, ...], item_bytes: int, size: int) -> bytes:
-    """Return the pixels of a chunk of the filter bitshuffle: plain, or blocks compressed by LZ4 or Zstd."""
+    """Undo bitshuffle, plain or with blocks compressed by LZ4 or Zstd.
+
+    `values[4]` is the compression: 0, 2 (LZ4) or 3 (Zstd). A compressed chunk states its bytes of pixels (8 bytes)
+    and of a block (4 bytes), then the length and content of each block. Pixels that fill no group of 8 follow plain.
+    """
     compression = values[4] if len(values) > 4 else 0
     if compression == 0:
         whole = len(stored) // (8 * item_bytes) * 8 * item_bytes
@@ -134,7 +141,7 @@ def _bits_in_order(stored: bytes, values: tuple[int, ...], item_bytes: int, size
 
 
 def _starts(dataset: h5py.Dataset, number: int | None) -> Any:
-    """Return the places of the chunks that hold an image."""
+    """Return the indices of the first element of each chunk that holds a part of an image, in row order."""
     edges = dataset.chunks
     along = [range(0, size, edge) for size, edge in zip(dataset.shape[-2:], edges[-2:], strict=True)]
     first = [] if number is None else [(number // edges[0] * edges[0],)]
@@ -142,7 +149,7 @@ def _starts(dataset: h5py.Dataset, number: int | None) -> Any:
 
 
 def _is_written(dataset: h5py.Dataset, start: tuple[int, ...]) -> bool:
-    """Return whether a chunk was written; its pixels are not read where it holds more than a byte."""
+    """Return whether a chunk was written: a buffer of one byte is too small for it, so its pixels are not read."""
     try:
         dataset.id.read_direct_chunk(start, out=np.empty(1, np.uint8))
     except ValueError:  # one byte is too small for it
