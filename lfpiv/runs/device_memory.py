@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.files import size_text
+from lfpiv.prompt import count
 from lfpiv.runs import memory
 from lfpiv_kernels import runtime
 from lfpiv_kernels.runtime import Device
@@ -55,11 +56,8 @@ def _refusal(experiment: Experiment, need: DeviceNeed, device: Device, sharing: 
     """Return the message for a run that cannot fit."""
     shape = " x ".join(map(str, experiment.grid.shape))
     needs = f"{size_text(sharing * need.whole)} of the GPU's memory"
-    if sharing > 1:
-        fits = max(free // max(need.whole, 1), 1)
-        remedy = f"Use at most {fits} {'worker' if fits == 1 else 'workers'} per GPU"
-    else:
-        remedy = "Raise volume.voxel_mm"
+    fits = free // max(need.whole, 1)
+    remedy = f"Use at most {count(fits, 'worker')} per GPU, raise volume.voxel_mm" if fits else "Raise volume.voxel_mm"
     return (
         f"{experiment.path}: volume: {shape} voxels (z, y, x) and {len(experiment.cameras)} camera(s) need about "
         f"{needs}; {size_text(free)} are free on {device.name or device.kind}. "

@@ -159,6 +159,8 @@ def test_a_volume_that_cannot_fit_into_the_gpu_is_refused(small_run, monkeypatch
         require(need.whole - 1)
     with pytest.raises(InputError, match="Use at most 2 workers per GPU"):
         require(2 * need.whole, sharing=3)
+    with pytest.raises(InputError, match=r"free on NVIDIA TEST\. Raise"):
+        require(need.whole - 1, sharing=3)
 
 
 def test_a_run_that_cannot_fit_into_the_gpu_begins_no_work(small_run, tmp_path, monkeypatch, capfd):
