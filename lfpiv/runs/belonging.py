@@ -22,18 +22,14 @@ from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts
 from lfpiv.selfcalibration.belonging import (
     CLEAR,
-    FLIPS,
-    IN_TIME,
     SURE,
     ImageFit,
-    Images,
     Judgement,
-    Kind,
-    Mistake,
     judge,
 )
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes
 from lfpiv.selfcalibration.frame_order import exchanged, own_motion
+from lfpiv.selfcalibration.mistakes import FLIPS, IN_TIME, Images, Kind, Mistake
 from lfpiv.warn import Code, Warning, name_pairs, warn
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ import numpy as np
 
 from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
-from lfpiv.selfcalibration.belonging import ITERATIONS, PART_LENSES, Images
+from lfpiv.selfcalibration.belonging import ITERATIONS, PART_LENSES
+from lfpiv.selfcalibration.mistakes import Images
 from lfpiv.weights.operator import Weights
 
 CLEAR = 6.0

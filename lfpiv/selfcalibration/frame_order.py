@@ -19,10 +19,9 @@ from lfpiv.selfcalibration.disparity import (
     FIT_REACH,
     cut_into_windows,
     fit_peak,
-    masked_correlation,
-    mirrored_window,
     slant,
 )
+from lfpiv.selfcalibration.masked_correlation import masked_correlation, mirrored_window
 
 REACH_VOXEL = 8
 """Largest displacement of particles along each axis that is sought [voxel]."""

@@ -13,7 +13,8 @@ from lfpiv.calibration.camera import Calibration
 from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.runs.reversed_pairs import reversed_pairs
-from lfpiv.selfcalibration.belonging import FLIPS, ImageFit, Judgement, Kind, Mistake, judge
+from lfpiv.selfcalibration.belonging import ImageFit, Judgement, judge
+from lfpiv.selfcalibration.mistakes import FLIPS, Kind, Mistake
 from lfpiv.warn import Code
 
 OTHERS, NEAR = (1, 2), (3,)

@@ -14,7 +14,7 @@ import lfpiv
 from lfpiv.calibration.camera import Calibration
 from lfpiv.geometry.grid import Grid
 from lfpiv.runs import belonging, moved_cameras, pipeline
-from lfpiv.selfcalibration import disparity, movements
+from lfpiv.selfcalibration import disparity, masked_correlation, movements
 from lfpiv.selfcalibration.disparity import Disparity
 from lfpiv.selfcalibration.movements import Movement
 from lfpiv.simulation.simulator import simulate
@@ -78,7 +78,7 @@ def naive_coefficients(first, second, window, centre, reach):
     for place in np.ndindex(*out.shape):
         to = at + np.array(place) - reach + centre
         inside = ((to >= 0) & (to < second[0].shape)).all(1)
-        if inside.sum() < disparity.LEAST_OVERLAP * len(at):
+        if inside.sum() < masked_correlation.LEAST_OVERLAP * len(at):
             continue
         products = spread = other = 0.0
         for one, two in zip(first, second, strict=True):
@@ -103,7 +103,7 @@ def test_coefficients_are_those_of_the_overlap(centre):
     rng = np.random.default_rng(3)
     first, second = ([rng.gamma(0.3, size=(5, 7, 6)) for _ in range(2)] for _ in range(2))
     window = slice(0, 4), slice(3, 7), slice(1, 5)
-    found = disparity.masked_correlation(first, second, window, centre, 2)
+    found = masked_correlation.masked_correlation(first, second, window, centre, reach=2)
     assert np.abs(found - naive_coefficients(first, second, window, centre, 2)).max() < SUMS
     assert (found == 0).any() and (np.abs(found) > 0.1).any()
 
