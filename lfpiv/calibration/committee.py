@@ -34,14 +34,15 @@ class Chosen:
     training: Training
     """The network, as it was trained; an element of the sequence given."""
     scatter: float
-    """Error that the chance of the training makes, in the unit of the networks' outputs. It is the mean distance to the
-    other networks over the square root of 2, since both ends of a distance have errors."""
+    """Error that the chance of the training makes, in the unit of the networks' outputs. It is the median distance to
+    the other networks over the square root of 2, since both ends of a distance have errors. A few networks that are far
+    off do not change a median."""
 
 
 def nearest_to_others(
     trainings: Sequence[Training], region_mm: np.ndarray, pupil_radius_mm: float, seed: int
 ) -> Chosen:
-    """Choose the network with the least mean distance to the others, over rays of a box through the whole pupil.
+    """Choose the network with the least median distance to the others, over rays of a box through the whole pupil.
 
     Parameters
     ----------
@@ -62,6 +63,6 @@ def nearest_to_others(
     rays = np.hstack([rng.uniform(low, high, (RAYS, 3)), random_on_pupil(pupil_radius_mm, RAYS, rng)])
     mapped = np.stack([one.network(rays) for one in trainings])
     between = np.linalg.norm(mapped[:, None] - mapped, axis=-1).mean(-1)  # distance of each two networks, over the rays
-    distances = between.sum(1) / (len(trainings) - 1)
+    distances = np.median(np.sort(between, axis=1)[:, 1:], axis=1)  # less the distance to itself, which is 0
     best = int(distances.argmin())
     return Chosen(training=trainings[best], scatter=float(distances[best] / np.sqrt(2)))
