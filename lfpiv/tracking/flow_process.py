@@ -3,18 +3,21 @@
 A link measures y = u(x) + e. The error e has the stated variance, and the variance of structures smaller than the
 process resolves. Once the links' median is subtracted, components of the flow u have the mean 0 and the covariance [1]_
 
-    independent:     s^2 exp(-r^2 / 2 l^2) I
+    independent:     diag(s_x^2, s_y^2, s_z^2) exp(-r^2 / 2 l^2)
     incompressible:  s^2 [(1 - r^2 / 2 l^2) I + r r' / 2 l^2] exp(-r^2 / 2 l^2)
 
-Strength s, length l, and the unresolved scatter maximise the evidence of the links [2]_; so does the choice between
-both forms. Links that disagree with the process lose weight (Cauchy). The links of a single camera show depth many
-times less precisely than the other components, which tell about it where the flow is incompressible.
+Strengths s, length l, and the unresolved scatter maximise the evidence of the links [2]_, and the choice of the form
+maximises it less half the logarithm of the data for each parameter [3]_. The strengths of independent components are
+one or three: where depth alone moves, still components that links show precisely would hold it still. Links that
+disagree with the process lose weight (Cauchy). The links of a single camera show depth many times less precisely than
+the other components, which tell about it where the flow is incompressible.
 
 References
 ----------
 .. [1] F. J. Narcowich, J. D. Ward, "Generalized Hermite interpolation via matrix-valued conditionally positive definite
    functions", Math. Comp. 63 (1994) 661, doi:10.1090/S0025-5718-1994-1254147-6.
 .. [2] C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", MIT Press, 2006, chapter 5.
+.. [3] G. Schwarz, "Estimating the dimension of a model", Ann. Stat. 6 (1978) 461-464, doi:10.1214/aos/1176344136.
 """
 
 from __future__ import annotations
@@ -63,13 +66,13 @@ JITTER = 1e-10
 class FlowCovariance(Kernel):  # type: ignore[misc]
     """Covariance of links, for `sklearn.gaussian_process`.
 
-    A row is a component of a link: place (3) [voxel], component (0, 1, 2), variance [voxel^2], weight. With links given
-    alone, the variances of their errors are added.
+    `strength` is one number, or three for independent components. A row is a component of a link: place (3) [voxel],
+    component (0, 1, 2), variance [voxel^2], weight. With links given alone, the variances of their errors are added.
     """
 
     def __init__(
         self,
-        strength: float = START[0],
+        strength: float | np.ndarray = START[0],
         length: float = START[1],
         scatter: float = START[2],
         incompressible: bool = False,
@@ -92,7 +95,7 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
     @property
     def hyperparameter_strength(self) -> Hyperparameter:
         """Bounds of the strength, for scikit-learn."""
-        return Hyperparameter("strength", "numeric", STRENGTHS)
+        return Hyperparameter("strength", "numeric", STRENGTHS, np.size(self.strength))
 
     def __call__(self, X: np.ndarray, Y: np.ndarray | None = None, eval_gradient: bool = False) -> Any:
         """Return the covariance, and with `eval_gradient` its derivatives by the logarithms of the parameters."""
@@ -104,7 +107,9 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
         if not eval_gradient:
             return covariance
         by_scatter = np.diag(2 * self.scatter**2 / X[:, 5])
-        return covariance, np.stack([by_length, by_scatter, 2 * smooth], axis=2)  # in the order of the names
+        own = [smooth * (X[:, None, 3] == axis) for axis in range(3)] if np.size(self.strength) > 1 else [smooth]
+        by_strength = [2 * part for part in own]
+        return covariance, np.stack([by_length, by_scatter, *by_strength], axis=2)  # in the order of the names
 
     def noise(self, rows: np.ndarray) -> np.ndarray:
         """Return the variances of the errors of rows [voxel^2]."""
@@ -117,8 +122,9 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
         square = np.square(apart).sum(0)
         value, slope = (np.zeros((3, len(a) // 3, 3, len(b) // 3)) for _ in range(2))
         scaled = square / self.length**2
-        bell = self.strength**2 * np.exp(-scaled / 2)
+        each = np.broadcast_to(self.strength, 3)
         for i in range(3):
+            bell = each[i] ** 2 * np.exp(-scaled / 2)
             value[i, :, i] = bell * (1 - scaled / 2) if self.incompressible else bell
             slope[i, :, i] = bell * scaled * (2 - scaled / 2) if self.incompressible else bell * scaled
             for j in range(3) if self.incompressible else ():
@@ -129,7 +135,8 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
 
     def diag(self, X: np.ndarray) -> np.ndarray:
         """Return the variance of each row."""
-        variance: np.ndarray = self.strength**2 + MEAN**2 + self.noise(X) + JITTER
+        own = np.broadcast_to(self.strength, 3)[X[:, 3].astype(int)]
+        variance: np.ndarray = own**2 + MEAN**2 + self.noise(X) + JITTER
         return variance
 
     def is_stationary(self) -> bool:
@@ -169,11 +176,11 @@ class FlowProcess:
         some = np.concatenate([np.arange(k * len(places), (k + 1) * len(places), every) for k in range(3)])
         part = cls(covariance=FlowCovariance(), level=level, rows=rows[some], targets=targets[some])
         forms = [FlowCovariance()]  # the most tolerant form tells which links are false
+        others = [FlowCovariance(incompressible=True), FlowCovariance(np.full(3, START[0]))]
         for number in range(ROUNDS):
             fits = [_fit(form, part.rows, part.targets) for form in forms]
-            best = max(fits, key=lambda fit: float(fit.log_marginal_likelihood_value_))
-            part = replace(part, covariance=best.kernel_).weighted()
-            forms = [best.kernel_, *([FlowCovariance(incompressible=True)] if number == 0 else [])]
+            part = replace(part, covariance=max(fits, key=_evidence).kernel_).weighted()
+            forms = [part.covariance, *(others if number == 0 else [])]
         return cls(covariance=part.covariance, level=level, rows=rows, targets=targets).weighted()
 
     def weighted(self) -> FlowProcess:
@@ -254,9 +261,15 @@ class FlowProcess:
                 yield windows, np.sort(np.argpartition(outside, few - 1)[:few])
 
 
+def _evidence(fit: GaussianProcessRegressor) -> float:
+    """Return the logarithm of the evidence, less what parameters gain by being fitted: the Bayesian criterion [3]_."""
+    return float(fit.log_marginal_likelihood_value_ - np.log(len(fit.X_train_)) * len(fit.kernel_.theta) / 2)
+
+
 def _fit(form: FlowCovariance, rows: np.ndarray, targets: np.ndarray) -> GaussianProcessRegressor:
     """Maximise the evidence from several lengths and from the form's own; return the best fit."""
-    starts = [form, *(form.clone_with_theta(np.log([length, START[2], START[0]])) for length in FIRST_LENGTHS)]
+    strengths = [START[0]] * np.size(form.strength)
+    starts = [form, *(form.clone_with_theta(np.log([length, START[2], *strengths])) for length in FIRST_LENGTHS)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # of a parameter at its bound
         fits = [GaussianProcessRegressor(start, alpha=0.0).fit(rows, targets) for start in starts]

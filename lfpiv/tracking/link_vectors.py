@@ -75,7 +75,7 @@ def vectors_from_links(vectors: xr.Dataset, links: xr.Dataset) -> xr.Dataset:
                 "number": int(valid.sum()),
                 "form": "incompressible" if process.covariance.incompressible else "independent",
                 "length": round(float(process.covariance.length), 2),
-                "strength": round(float(process.covariance.strength), 3),
+                "strength": round(float(np.sqrt(np.mean(np.square(process.covariance.strength)))), 3),
                 "scatter": round(float(process.covariance.scatter), 3),
             }
         )

@@ -9,6 +9,8 @@ from lfpiv.tracking.flow_process import FlowCovariance, FlowProcess
 
 DEPTH_ERROR, LATERAL_ERROR = 0.2, 0.02
 """Errors of a link that one camera shows [voxel]."""
+SHEAR_ERROR, SHEAR_LEFT = 0.5, 0.45
+"""Error of depth [voxel], and what may be left of the shear; a straight line through 45 links leaves 0.25."""
 WITHIN = 0.85
 """Least share of components within two stated standard deviations; the flow is no realisation of the process."""
 
@@ -54,6 +56,20 @@ def correlated():
     )
 
 
+def test_depth_that_alone_moves_is_not_held_by_the_other_components():
+    """A shear along the line of sight: links of one camera show still components 25 times more precisely."""
+    errors = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        places = rng.uniform(-0.5, 0.5, (45, 3)) * (32, 32, 20)
+        error = np.tile([LATERAL_ERROR, LATERAL_ERROR, SHEAR_ERROR], (45, 1))
+        true = np.stack([np.zeros(45), np.zeros(45), 0.07 * places[:, 0]], axis=1)
+        process = FlowProcess.fitted(places, true + error * rng.standard_normal((45, 3)), error)
+        found, _ = process.means(places, np.zeros(3))
+        errors.append(np.sqrt(np.mean((found - true)[:, 2] ** 2)) / true[:, 2].std())
+    assert np.median(errors) < SHEAR_LEFT, errors
+
+
 def true_means(vectors):
     """The flow's means over windows of 12 voxels, shape (window, 3)."""
     centres = np.stack(np.meshgrid(*(vectors[axis].values / 0.1 for axis in "zyx"), indexing="ij"), -1)[..., ::-1]
@@ -62,14 +78,16 @@ def true_means(vectors):
     return np.array([flow(centre + cube).mean(0) for centre in centres.reshape(-1, 3)])
 
 
-@pytest.mark.parametrize("incompressible", [False, True])
-def test_covariance_is_positive_and_its_derivatives_are_right(incompressible):
+@pytest.mark.parametrize(
+    ("strength", "incompressible"), [(0.7, False), (0.7, True), (np.array([0.1, 0.7, 2.0]), False)]
+)
+def test_covariance_is_positive_and_its_derivatives_are_right(strength, incompressible):
     places, _, error = links(12, 1)
     process = FlowProcess.fitted(places, flow(places), error)
-    covariance = FlowCovariance(strength=0.7, length=8.0, scatter=0.1, incompressible=incompressible)
+    covariance = FlowCovariance(strength=strength, length=8.0, scatter=0.1, incompressible=incompressible)
     matrix, slopes = covariance(process.rows, eval_gradient=True)
     assert np.linalg.eigvalsh(matrix).min() > 0
-    for k, step in enumerate(1e-5 * np.eye(3)):
+    for k, step in enumerate(1e-5 * np.eye(len(covariance.theta))):
         high, low = (covariance.clone_with_theta(covariance.theta + sign * step)(process.rows) for sign in (1, -1))
         np.testing.assert_allclose(slopes[..., k], (high - low) / 2e-5, atol=1e-8)
 
