@@ -26,7 +26,7 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
-from lfpiv.calibration.committee import MOST_NETWORKS, NETWORKS, nearest_to_others
+from lfpiv.calibration.committee import train_several
 from lfpiv.calibration.liquid import median_distance
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
@@ -277,19 +277,10 @@ def _fit_mapping(
             unit=pitch_mm,
         )
 
-    region_mm, trainings = np.stack([points.min(0), points.max(0)]), list[Training]()
-    for number in range(MOST_NETWORKS):
-        with input_errors(place):
-            trainings.append(trained(settings.seed + number))
-        if len(trainings) >= NETWORKS:
-            chosen = nearest_to_others(trainings, region_mm, setup.optics.pupil_radius_mm, settings.seed)
-            if chosen.scatter < chosen.training.sigma_nor * pitch_mm:
-                break
-    training = replace(chosen.training, seconds=sum(one.seconds for one in trainings))
-    log.debug(
-        "camera %s: network %d of %d; networks scatter by %.2g pitch", setup.name,
-        trainings.index(chosen.training) + 1, len(trainings), chosen.scatter / pitch_mm,
-    )  # fmt: skip
+    region_mm = np.stack([points.min(0), points.max(0)])
+    with input_errors(place):
+        chosen = train_several(trained, region_mm, setup.optics.pupil_radius_mm, seed=settings.seed, unit=pitch_mm)
+    training = chosen.training
     held_out = training.split.test
     inputs = stated_mm[agreeing][held_out], pupil[held_out]
     mapped = training.network(np.hstack(inputs)) + (0.0 if baseline is None else baseline(*inputs))
@@ -298,7 +289,7 @@ def _fit_mapping(
         baseline=baseline,
         training=training,
         agreeing=agreeing,
-        scatter=chosen.scatter / pitch_mm,
+        scatter=chosen.scatter,
         sigma_nor_stated=float(stated.mean()),
     )
 

@@ -12,13 +12,16 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration.training import Training
 from lfpiv.geometry.optics import random_on_pupil
+
+log = logging.getLogger(__name__)
 
 NETWORKS, MOST_NETWORKS = 3, 7
 """Least and largest number of networks that are trained for a camera. Two networks are equally far from each other, so
@@ -32,11 +35,44 @@ class Chosen:
     """The network nearest to the others."""
 
     training: Training
-    """The network, as it was trained; an element of the sequence given."""
+    """The network, as it was trained."""
     scatter: float
-    """Error that the chance of the training makes, in the unit of the networks' outputs. It is the median distance to
-    the other networks over the square root of 2, since both ends of a distance have errors. A few networks that are far
-    off do not change a median."""
+    """Error that the chance of the training makes. It is the median distance to the other networks over the square root
+    of 2, since both ends of a distance have errors. A few networks that are far off do not change a median."""
+
+
+def train_several(
+    train: Callable[[int], Training], region_mm: np.ndarray, pupil_radius_mm: float, *, seed: int, unit: float
+) -> Chosen:
+    """Train networks of seeds `seed`, `seed` + 1, ... and choose the one nearest to the others.
+
+    Parameters
+    ----------
+    train : callable
+        Trains a network with a seed, see `lfpiv.calibration.training.train`.
+    region_mm, pupil_radius_mm
+        As `nearest_to_others` takes them.
+    seed : int
+        Seed of the first network, and of the rays.
+    unit : float
+        Length in which the trainings state their errors [mm].
+
+    Returns
+    -------
+    Chosen
+        With the time of all trainings, and the scatter in multiples of `unit`.
+    """
+    trainings = [train(seed + number) for number in range(NETWORKS)]
+    found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
+    while found.scatter >= found.training.sigma_nor * unit and len(trainings) < MOST_NETWORKS:
+        trainings.append(train(seed + len(trainings)))
+        found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
+    number = trainings.index(found.training) + 1
+    log.debug(
+        "network %d of %d is nearest to the others, which scatter by %.2g mm", number, len(trainings), found.scatter
+    )
+    training = replace(found.training, seconds=sum(one.seconds for one in trainings))
+    return Chosen(training=training, scatter=found.scatter / unit)
 
 
 def nearest_to_others(
@@ -58,6 +94,7 @@ def nearest_to_others(
     Returns
     -------
     Chosen
+        An element of `trainings`, and the scatter in the unit of the networks' outputs.
     """
     rng, (low, high) = np.random.default_rng(seed), region_mm
     rays = np.hstack([rng.uniform(low, high, (RAYS, 3)), random_on_pupil(pupil_radius_mm, RAYS, rng)])

@@ -20,13 +20,7 @@ from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
 from lfpiv.selfcalibration import dark_parts
-from lfpiv.selfcalibration.belonging import (
-    CLEAR,
-    SURE,
-    ImageFit,
-    Judgement,
-    judge,
-)
+from lfpiv.selfcalibration.belonging import CLEAR, SURE, ImageFit, Judgement, judge
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes
 from lfpiv.selfcalibration.frame_order import exchanged, own_motion
 from lfpiv.selfcalibration.mistakes import FLIPS, IN_TIME, Images, Kind, Mistake
@@ -184,12 +178,9 @@ def not_told(names: Sequence[str], judged: Mapping[int, Judgement]) -> str:
     doubted = [made for one in judged.values() if (made := one.doubted)]
     if len(doubted) < len(judged):
         return "; they do not tell the order of frames"
-    cameras = (
-        names if len(names) == 2 else dict.fromkeys(name for made in doubted for one in made for name in one.cameras)
-    )
-    return (
-        f"; the frames of {' or '.join(cameras)} would fit better if they were exchanged: check the order of its images"
-    )
+    named = dict.fromkeys(name for made in doubted for one in made for name in one.cameras)
+    either = " or ".join(names if len(names) == 2 else named)
+    return f"; the frames of {either} would fit better if they were exchanged: check the order of its images"
 
 
 def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dict[int, Judgement]:

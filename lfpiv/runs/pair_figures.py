@@ -66,7 +66,7 @@ class LinkFigures:
     length: float
     """Length of the flow's structures [voxel]."""
     strength: float
-    """Standard deviation of the displacement about its mean [voxel]."""
+    """Standard deviation of a component of the displacement about its mean, root mean square over x, y, z [voxel]."""
     scatter: float
     """Standard deviation of what the links do not resolve [voxel]."""
 

@@ -141,8 +141,7 @@ class Judgement:
         clear = [one for one in self.tried if self.margin(one) < -CLEAR]
         if not clear or not self._beats_chance(clear[0]):
             return ()
-        best = self.left[clear[0]]
-        return tuple(one for one in clear if advantage(best, self.left[one]) < SURE)
+        return tuple(one for one in clear if self.as_good(clear[0], one))
 
     def _beats_chance(self, best: Mistake) -> bool:
         """Return whether images without a mistake fit clearly better than those of other particles.
@@ -198,8 +197,7 @@ class Judgement:
         order = [one for one in self.tried if one.kind is Kind.FRAMES and self.margin(one) < -SURE]
         if not self.fits or not order:
             return ()
-        best = self.left[order[0]]
-        return tuple(one for one in order if advantage(best, self.left[one]) < SURE)
+        return tuple(one for one in order if self.as_good(order[0], one))
 
     @property
     def over_chance(self) -> float:
@@ -234,7 +232,7 @@ class Judgement:
         return [(b - a)[counts] for a, b in zip(self.left[RIGHT], self.left[one], strict=False)]
 
     def as_good(self, mistake: Mistake, rival: Mistake) -> bool:
-        """Return whether the images without another mistake fit better than, or as well as, those without this one."""
+        """Return whether images without `rival` fit as well as images without `mistake`, or better."""
         return advantage(self.left[mistake], self.left[rival]) < SURE
 
     def joined(self, other: Judgement) -> Judgement:

@@ -15,12 +15,7 @@ import numpy as np
 
 from lfpiv.calibration.camera import CalibratedCamera
 from lfpiv.geometry.grid import Grid
-from lfpiv.selfcalibration.disparity import (
-    FIT_REACH,
-    cut_into_windows,
-    fit_peak,
-    slant,
-)
+from lfpiv.selfcalibration.disparity import FIT_REACH, cut_into_windows, fit_peak, slant
 from lfpiv.selfcalibration.masked_correlation import masked_correlation, mirrored_window
 
 REACH_VOXEL = 8

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
+import scipy  # loads its parts where they are used
 
 import lfpiv
 from lfpiv.errors import InputError

@@ -6,11 +6,11 @@ process resolves. Once the links' median is subtracted, components of the flow u
     independent:     diag(s_x^2, s_y^2, s_z^2) exp(-r^2 / 2 l^2)
     incompressible:  s^2 [(1 - r^2 / 2 l^2) I + r r' / 2 l^2] exp(-r^2 / 2 l^2)
 
-Strengths s, length l, and the unresolved scatter maximise the evidence of the links [2]_, and the choice of the form
-maximises it less half the logarithm of the data for each parameter [3]_. The strengths of independent components are
-one or three: where depth alone moves, still components that links show precisely would hold it still. Links that
-disagree with the process lose weight (Cauchy). The links of a single camera show depth many times less precisely than
-the other components, which tell about it where the flow is incompressible.
+Strengths s, length l, and the unresolved scatter maximise the evidence of the links [2]_. The form is chosen by the
+logarithm of this evidence, less half the logarithm of the number of data for each parameter [3]_. Independent
+components share one strength, or each has its own. With a shared one, components that stand still would hide a flow
+along the line of sight: links of a single camera show depth many times less precisely than the other components. Where
+the flow is incompressible, these tell about depth. Links that disagree with the process lose weight (Cauchy).
 
 References
 ----------
@@ -175,7 +175,7 @@ class FlowProcess:
         every = max(-(-len(places) // MOST_FITTED), 1)
         some = np.concatenate([np.arange(k * len(places), (k + 1) * len(places), every) for k in range(3)])
         part = cls(covariance=FlowCovariance(), level=level, rows=rows[some], targets=targets[some])
-        forms = [FlowCovariance()]  # the most tolerant form tells which links are false
+        forms = [FlowCovariance()]  # independent components tell which links are false
         others = [FlowCovariance(incompressible=True), FlowCovariance(np.full(3, START[0]))]
         for number in range(ROUNDS):
             fits = [_fit(form, part.rows, part.targets) for form in forms]
@@ -262,7 +262,7 @@ class FlowProcess:
 
 
 def _evidence(fit: GaussianProcessRegressor) -> float:
-    """Return the logarithm of the evidence, less what parameters gain by being fitted: the Bayesian criterion [3]_."""
+    """Return the logarithm of the evidence, less what fitted parameters gain by chance (Schwarz [3]_)."""
     return float(fit.log_marginal_likelihood_value_ - np.log(len(fit.X_train_)) * len(fit.kernel_.theta) / 2)
 
 

@@ -238,7 +238,7 @@ SENTENCES: Mapping[Code, str] = {
         "particles of {size:.2f} voxel demand that voxels of {demanded_mm:.3g} mm are reconstructed, the memory allows "
         "{used_mm:.3g} mm: expect more ghosts; raise compute.memory_gib or shrink volume.size_mm"
     ),
-    Code.APART: ("{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: {cause}; {advice}."),
+    Code.APART: "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: {cause}; {advice}.",
     Code.NOTHING_IN_COMMON: (
         "{names} show no particles in common within {search} voxels, so no vector is valid: a camera moved by more, "
         "their images are of different instants, or show very few particles."

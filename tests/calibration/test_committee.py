@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lfpiv.calibration.committee import nearest_to_others
+from lfpiv.calibration.committee import MOST_NETWORKS, NETWORKS, nearest_to_others, train_several
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.optics import random_on_pupil
 
 REGION_MM, PUPIL_MM = np.array([[-2.0, -2, -1], [2, 2, 1]]), 12.5
 BORDER_MM = 0.3  # error of a network at one border, where no sample shows it
+LENGTH_MM = 1e4  # unit in which errors are far below 1, so that no further network is trained
 SHIFT_MM = 0.004  # of a network, along one output, against two equal ones
 
 
@@ -50,3 +51,23 @@ def test_the_scatter_is_the_error_of_a_network(trainings):
     errors = [np.linalg.norm(one.network(rays) - places(rays), axis=1).mean() for one in trainings]
     found = nearest_to_others(trainings, REGION_MM, PUPIL_MM, seed=0).scatter
     assert min(errors) / 2 < found < 2 * max(errors)  # three networks tell a mean error within a factor of two
+
+
+@pytest.mark.parametrize(("apart_mm", "expected"), [(0.0, NETWORKS), (BORDER_MM, MOST_NETWORKS)])
+def test_more_networks_are_trained_while_they_scatter(trainings, apart_mm, expected):
+    seeds = []
+
+    def trained(seed):
+        seeds.append(seed)
+        return dataclasses.replace(shifted(trainings[0], apart_mm * 2.0 ** len(seeds)), seconds=1.0)
+
+    chosen = train_several(trained, REGION_MM, PUPIL_MM, seed=4, unit=1.0)
+    assert seeds == list(range(4, 4 + expected)) and chosen.training.seconds == expected
+    assert (chosen.scatter >= chosen.training.sigma_nor) == (apart_mm > 0)
+
+
+def test_the_scatter_is_stated_in_the_unit_of_the_errors(trainings):
+    several = iter(trainings)
+    chosen = train_several(lambda _: next(several), REGION_MM, PUPIL_MM, seed=0, unit=LENGTH_MM)
+    alone = nearest_to_others(trainings, REGION_MM, PUPIL_MM, seed=0)
+    assert chosen.scatter == pytest.approx(alone.scatter / LENGTH_MM)
