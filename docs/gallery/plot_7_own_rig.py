@@ -53,7 +53,7 @@ experiment = lfpiv.open_experiment(simulate(scene, Path(folder.name) / "rig"))
 calibration = lfpiv.calibrate(experiment)
 seen = calibration.cameras["left"]
 print(f"{seen.report.dots_found} of {seen.report.dots_expected} dots")
-print(f"sigma_nor on held-out dots: {seen.report.sigma_nor_test:.4f} pitch")
+print(f"sigma_nor: {seen.report.sigma_nor_test:.4f} pitch")
 
 rng = np.random.default_rng(0)
 points = rng.uniform(-1, 1, (4000, 3)) * (1.25, 1.25, 1.0)

@@ -225,7 +225,7 @@ def _calibrate_camera(
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
     checks.check_pupil_zones(setup, dots, sensor.lattice.pitch_mm)
     log.info(
-        "camera %s: calibrated with %d of %d dots; at dots that were held back, rays are off by %.2g microlens pitches",
+        "camera %s: calibrated with %d of %d dots; rays are off by %.2g microlens pitches (sigma_nor)",
         setup.name, quality.dots_found, quality.dots_expected, quality.sigma_nor_test,
     )  # fmt: skip
     step(1.0)

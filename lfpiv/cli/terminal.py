@@ -270,7 +270,7 @@ def print_calibration(summary: dict[str, Any]) -> None:
     for name, figures in summary["calibration"].items():
         say(
             f"{name}: {figures['dots_found']} of {figures['dots_expected']} dots, "
-            f"sigma_nor {figures['sigma_nor_test']:.4f} pitch on held-out dots, "
+            f"sigma_nor {figures['sigma_nor_test']:.4f} pitch, "
             f"lens array fitted to {figures['lens_array_rms_px']:.3f} px"
         )
 

@@ -32,7 +32,7 @@ BINS = 50
 """Number of bins of a histogram of errors."""
 
 _ROWS = (
-    ("error on held-out dots, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
+    ("error of the mapping, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
     ("the same with the board as stated [pitch]", "sigma_nor_stated", 4),
     ("dots measured", "dots_found", 0),
     ("dots in the field", "dots_expected", 0),
@@ -95,7 +95,7 @@ def _overview(figures: Mapping[str, CameraFigures]) -> str:
     ]
     if not texts:
         return "Rays by the nominal geometry, without a board."
-    return f"Error on held-out dots: {'; '.join(texts)}. A pitch is the distance between microlenses."
+    return f"Error of the mapping: {'; '.join(texts)}. A pitch is the distance between microlenses."
 
 
 def _board_figure(

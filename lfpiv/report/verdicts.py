@@ -81,7 +81,7 @@ def _tiles(experiment: Experiment, summary: Summary) -> Iterator[Tile]:
         )
         yield _above_is_bad(
             max(sigma),
-            "mapping on held-out dots, worst camera",
+            "error of the mapping, worst camera",
             good=usual,
             bad=MAPPING_BAD * usual,
             written=lambda error: f"{significant(error, 2)} pitch",

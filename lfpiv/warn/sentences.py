@@ -204,8 +204,8 @@ SENTENCES: Mapping[Code, str] = {
         "the dots; use more dots or planes, or fewer nodes (network.hidden)."
     ),
     Code.MAPPING_ERROR: (
-        "the mapping is {sigma_nor:.3f} pitch off on held-out dots (sigma_nor), {usual:g} and less is usual; use "
-        "more dots or planes, and check the board's images."
+        "the mapping is {sigma_nor:.3f} pitch off (sigma_nor), {usual:g} and less is usual; use more dots or planes, "
+        "and check the board's images."
     ),
     Code.PUPIL_ZONE: (
         "the dots' light lies up to {off_pitch:.3f} pitch beside the fitted rays, most at ({u:.1f}, {v:.1f}) pupil "
