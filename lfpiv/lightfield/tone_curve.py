@@ -1,13 +1,16 @@
-"""Find a gamma curve, or another tone curve, by the counts that an image never holds.
+"""Find a gamma curve, or another tone curve, by the counts that an image never holds, or that share a value.
 
 A sensor's counts are proportional to light, and all counts between the darkest pixels and the particles occur. A curve
 that brightens dark pixels moves neighbouring counts apart, the more the darker they are, and leaves the values between
-them empty. With ``I' ~ I**(1 / gamma)`` the distance of neighbours goes with ``I'**(1 - gamma)``.
+them empty. With ``I' ~ I**(1 / gamma)`` the distance of neighbours goes with ``I'**(1 - gamma)``. Where a curve leads
+to fewer bits, values are not empty, but take unlike numbers of counts (`lfpiv.lightfield.merged_counts`).
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+from lfpiv.lightfield.merged_counts import merged_exponent
 
 CURVED = 1.3
 """Exponent of a gamma curve above which an image is not proportional to light."""
@@ -36,6 +39,15 @@ def tone_exponent(image: np.ndarray) -> float:
     if whole.min() < 0 or whole.max() > _MOST or not np.array_equal(whole, image):
         return 1.0
     pixels = np.bincount(whole.ravel())
+    exponent = _exponent_by_gaps(pixels)
+    if exponent > 1:
+        return exponent
+    unit = int(np.gcd.reduce(np.flatnonzero(pixels)))
+    return merged_exponent(pixels[:: max(unit, 1)])
+
+
+def _exponent_by_gaps(pixels: np.ndarray) -> float:
+    """Return the exponent by the values that never occur, from the number of pixels of each value."""
     values = np.flatnonzero(pixels)
     steps, count = np.diff(values), pixels[values]
     if not steps.size:

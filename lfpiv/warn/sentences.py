@@ -104,8 +104,8 @@ SENTENCES: Mapping[Code, str] = {
         "power or the camera's gain"
     ),
     Code.TONE_CURVE: (
-        "counts are not proportional to light: dark neighbouring counts lie apart as after a gamma curve of about "
-        "{exponent:.1f}. Record without gamma or another tone curve, or undo it before lfpiv reads the images"
+        "counts are not proportional to light, but to light after a gamma curve of about {exponent:.1f}. Record "
+        "without gamma or another tone curve, or undo it before lfpiv reads the images"
     ),
     Code.UNEVEN: (
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
