@@ -23,7 +23,7 @@ from lfpiv.calibration.network import Network
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import CameraSetup, Experiment
+from lfpiv.experiment.experiment import CameraSetup, Experiment, white_level
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import (
     APERTURE,
@@ -104,7 +104,7 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
             raise InputError(f"{setup.white_path}: white_image of camera {setup.name!r}: {warning.sentence}")
         warn(log, replace(warning, subject=setup.name))
     noisy = decoder.background(white)[1] > ROUNDING  # without noise the middles of all microimages share one value
-    share = saturated_share(white, setup.white_level, piles=noisy)
+    share = saturated_share(white, white_level(setup.white_path, setup), piles=noisy)
     if share > SATURATED:
         warn(log, Warning(code=Code.WHITE_SATURATED, subject=setup.name, figures={"share": share}))
 
@@ -214,7 +214,7 @@ def check_light(
                 f"{paths[plane]}: board.images of camera {setup.name!r}: expected an image of its own, found the same "
                 f"image as {paths[other]}. Check what was copied."
             )
-        saturated[plane] = saturated_share(image, setup.white_level)
+        saturated[plane] = saturated_share(image, white_level(paths[plane], setup))
     worst = int(saturated.argmax())
     if saturated[worst] > SATURATED:
         figures = {"share": float(saturated[worst]), "path": str(paths[worst])}

@@ -328,6 +328,20 @@ def read_image_of(path: Path, label: str, camera: CameraSetup) -> np.ndarray:
     return image
 
 
+def white_level(path: Path, camera: CameraSetup) -> float | None:
+    """Return the value from which on pixels of an image are saturated: as stated, or else as its header says [counts].
+
+    None where neither says it, or where the file cannot be read, which is told elsewhere.
+    """
+    if camera.white_level is not None:
+        return camera.white_level
+    try:
+        header = images.read_header(path, "", camera.raw)
+    except InputError:
+        return None
+    return None if header is None else header.white_level
+
+
 def check_shape(path: Path, label: str, camera: CameraSetup) -> None:
     """Refuse an image that is missing, damaged, or of another shape than its camera's white image.
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from lfpiv import files, hdf5
 from lfpiv.errors import DamagedFile, InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, white_level
 from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.lightfield import background, decorrelation
@@ -122,10 +122,15 @@ def estimate(
     for number, (name, camera) in enumerate(cameras.items()):
         dark = experiment.dark(name)
         if experiment.camera(name).background is not None:
-            level = experiment.camera(name).white_level
             images = [experiment.background_image(name, frame) for frame in experiment.laser_names]
+            paths = [experiment.background_path(name, frame) for frame in experiment.laser_names]
             found[name] = background.recorded_light(
-                [_without_dark(image, dark, camera, level) for image in images if image is not None], camera.decoder
+                [
+                    _without_dark(image, dark, camera, white_level(path, experiment.camera(name)))
+                    for image, path in zip(images, paths, strict=True)
+                    if image is not None and path is not None
+                ],
+                camera.decoder,
             )
             log.info("background of %s: its background image", name)
         else:
@@ -246,7 +251,8 @@ def _read_series(
             continue
         for frame, image in zip(frames, images, strict=True):
             shift = 2 * (frame.number // apart) if experiment.recording.is_series else None
-            light, noise, saturated = _without_dark(image, dark, camera, experiment.camera(camera.name).white_level)
+            level = white_level(experiment.frame_path(camera.name, frame), experiment.camera(camera.name))
+            light, noise, saturated = _without_dark(image, dark, camera, level)
             power = 1.0 if estimate is None else estimate.power(light, frame.laser)
             series[frame.laser].add(light / np.float32(power), noise / power, saturated, shift)
             if keep:
@@ -274,12 +280,12 @@ def _log_series(experiment: Experiment, name: str, light: StandingLight, count: 
 
 
 def _without_dark(
-    raw: np.ndarray, dark: np.ndarray | None, camera: CalibratedCamera, white_level: float | None
+    raw: np.ndarray, dark: np.ndarray | None, camera: CalibratedCamera, saturated_from: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Return the light of an image above its dark level, its noise, and its saturated pixels."""
     image = raw if dark is None else raw - dark
     level, noise = camera.decoder.background(image)
-    return image - np.float32(level), noise, saturated_pixels(raw, white_level)
+    return image - np.float32(level), noise, saturated_pixels(raw, saturated_from)
 
 
 def content_hash(standing: Mapping[str, StandingLight]) -> str | None:

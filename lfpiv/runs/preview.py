@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment
+from lfpiv.experiment.experiment import Experiment, white_level
 from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
@@ -176,6 +176,8 @@ def _level(
         noise=noise,
         peak=peak if np.isfinite(peak) else 0.0,
         lit=float((brightest > PEAK_SIGMA * noise).mean()),
-        saturated=saturated_share(recorded, experiment.camera(name).white_level),
+        saturated=saturated_share(
+            recorded, white_level(experiment.frame_path(name, light.frame), experiment.camera(name))
+        ),
         structure=light.structure[name],
     )

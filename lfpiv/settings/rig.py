@@ -138,8 +138,8 @@ class CameraTable(NominalCamera):
     """Path, optionally with ``{frame}``, of an image of the scene lit by the laser, without particles; absent: the
     series of image pairs shows what stands still."""
     white_level: Positive | None = None
-    """Value from which on pixels are saturated, such as the white level in a camera's header [count]; absent: the
-    value at which the pixels of an image pile up."""
+    """Value from which on pixels are saturated [count]; absent: the white level of a ``.cine`` header, and the value at
+    which the pixels of an image pile up."""
     image_flip: Flip | None = None
     """How pictures show the scene: "horizontal" as it is seen (an ordinary camera), "vertical" upside down, "none"
     mirrored left to right, "both" mirrored and upside down; absent: read as "none" where the board agrees."""

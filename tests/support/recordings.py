@@ -31,7 +31,7 @@ def write_cine(path, frames, bits=16, *, interval_s=None, exposure_s=None, first
     blocks : bool
         Whether there are blocks of times and exposures.
     **setup
-        ``RealBPP``, ``CFA``, ``bFlipH``, ``bFlipV``, ``Rotate``, ``TrigFrame``, ``rate`` of the SETUP structure;
+        ``RealBPP``, ``CFA``, ``bFlipH``, ``bFlipV``, ``Rotate``, ``TrigFrame``, ``WhiteLevel``, ``rate`` of SETUP;
         ``Compression`` of the file's header; ``version`` 0 for offsets in 32 bits; ``annotation``, a text before each
         image; ``top_down`` where unpacked rows are stored from the top, which a negative ``biHeight`` says.
     """
@@ -236,6 +236,7 @@ def _cine_setup(columns, rows, fields):
     struct.pack_into("<I", setup, 800, 700)  # version of the software
     struct.pack_into("<I", setup, 808, fields.get("CFA", 0))
     struct.pack_into("<I", setup, 896, fields["RealBPP"])
+    struct.pack_into("<i", setup, 5736, fields.get("WhiteLevel", 0))
     return bytes(setup)
 
 

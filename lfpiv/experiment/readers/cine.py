@@ -29,6 +29,10 @@ SETUP_MARK_AT = 140
 """Place of ``Mark`` and ``Length`` in the SETUP structure, whose length depends on the software [byte]."""
 FLIPS_AT, RATE_AT, COLOUR_FILTER_AT, ROTATE_AT, EXPOSURE_AT = 756, 768, 808, 884, 1568
 """Places of ``bFlipH`` (``bFlipV`` follows), ``FrameRate``, ``CFA``, ``Rotate`` and ``ShutterNs`` in it [byte]."""
+BITS_AT, WHITE_AT = 896, 5736
+"""Places of ``RealBPP`` and ``WhiteLevel`` in it [byte]."""
+LEAST_WHITE = 0.75
+"""Least white level that is taken for one, in the largest value of a pixel."""
 SYNC_AT = 17
 """Place of ``TrigFrame``: 0 where the camera's own clock sets the rate [byte]."""
 TIMES, EXPOSURES = 1002, 1003
@@ -80,7 +84,7 @@ class Cine(Frames):
 
     def header(self, number: int) -> Header:
         """Return the header of an image as it is shown, perhaps turned."""
-        header = super().header(number)
+        header = replace(super().header(number), white_level=self._white_level())
         return replace(header, shape=header.shape[::-1]) if self._turns % 2 else header
 
     def decode(self, data: bytes) -> np.ndarray:
@@ -107,6 +111,16 @@ class Cine(Frames):
             exposure_s=exposure / 2**32 if exposure else shutter * 1e-9 or None,
             interval_s=1 / rate if rate and self._setup[SYNC_AT] == 0 else None,
         )
+
+    def _white_level(self) -> float | None:
+        """Return the white level of the SETUP structure, if it is near the largest value that pixels can have."""
+        bits = self._field(BITS_AT)
+        if self._packing:
+            bits = 12  # packed 10-bit codes are read as 12-bit counts
+        elif self.dtype.itemsize == 1:
+            bits = 8
+        level = self._field(WHITE_AT, "<i")
+        return float(level) if 8 <= bits <= 16 and LEAST_WHITE < level / ((1 << bits) - 1) <= 1 else None
 
     def _field(self, at: int, form: str = "<I") -> int:
         """Return a field of the SETUP structure; 0 where the software that wrote it did not know the field."""

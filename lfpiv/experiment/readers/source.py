@@ -36,6 +36,8 @@ class Header:
     """(rows, columns)."""
     dtype: str
     """Name of the pixel type."""
+    white_level: float | None = None
+    """Value from which on pixels are saturated [count]; None where the file states none."""
 
 
 @dataclass(frozen=True, kw_only=True)
