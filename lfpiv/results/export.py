@@ -51,9 +51,7 @@ class Format(enum.Enum):
 
     VTI = "one .vti image per pair or instant and one per stored volume, with .pvd collections: ParaView, pyvista"
     NETCDF = "vectors.nc, one NetCDF4 file of all pairs or instants: xarray, MATLAB"
-    ZARR = (
-        "vectors.zarr, one Zarr store of all pairs or instants, to which a later export adds what is new: xarray, dask"
-    )
+    ZARR = "vectors.zarr, one Zarr store of all pairs or instants: xarray, dask"
     CSV = "a table per pair or instant, a row per vector; of its linked particles; of all tracks; with units"
     VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection; one of tracks: ParaView"
     PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"

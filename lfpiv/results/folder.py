@@ -174,8 +174,15 @@ class Folder:
         InputError
             If another run holds the folder. The message names its process.
         """
-        with locked(self.lock):
+        with writing(self.lock):
+            file = _lock(self.lock)
+        try:
             yield
+        finally:
+            if file is not None:
+                with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
+                    self.lock.unlink()
+                os.close(file)
 
 
 class VectorFiles(Mapping[int, Path]):
@@ -194,26 +201,6 @@ class VectorFiles(Mapping[int, Path]):
 
     def __len__(self) -> int:
         return len(self._pairs)
-
-
-@contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold a lock file against other processes that write into its folder, and remove it at the end.
-
-    Raises
-    ------
-    InputError
-        If another process holds it. The message names the process.
-    """
-    with writing(path):
-        file = _lock(path)
-    try:
-        yield
-    finally:
-        if file is not None:
-            with contextlib.suppress(OSError):  # while locked: no other run has the file open and locked
-                path.unlink()
-            os.close(file)
 
 
 def _lock(path: Path) -> int | None:

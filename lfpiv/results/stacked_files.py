@@ -111,15 +111,6 @@ class StackedFiles:
         names = ("title", "experiment", "step", *COMMON)
         return {key: self.first.attrs[key] for key in (*names, ATTRIBUTE) if key in self.first.attrs}
 
-    @property
-    def signature(self) -> str:
-        """Everything that the files must share, as JSON."""
-        axes = {name: values.tolist() for name, values in self._reference.axes.items()}
-        attributes = {name: np.asarray(value).tolist() for name, value in self._reference.attributes.items()}
-        damping = None if self.damping is None else self.damping.to_json()
-        known = [self.dimension, attributes, axes, sorted(self._reference.names)]
-        return json.dumps(known if damping is None else [*known, damping], sort_keys=True)
-
     def read(self, place: int, names: Sequence[str]) -> list[np.ndarray]:
         """Read variables (z, y, x) of one file.
 
@@ -169,10 +160,6 @@ class StackedFiles:
             name: (dim, values[places], attributes) for name, (dim, values, attributes) in self.coordinates.items()
         }
         return xr.Dataset(variables, {**along, **{axis: self.first[axis] for axis in AXES}}, self.attributes)
-
-    def changed_ns(self) -> np.ndarray:
-        """Return the time of the last change of each file [ns]."""
-        return np.array([os.stat(self.path(place)).st_mtime_ns for place in range(len(self))], np.int64)
 
     def _compare(self, place: int, signature: Signature) -> None:
         _check_equal(signature, self._reference)

@@ -1,4 +1,4 @@
-"""Trust in stores: their form is checked before zarr opens them; a complete store is sealed, and verified.
+"""Trust in stores: their form is checked before zarr opens them; they are sealed, and verified.
 
 A NetCDF store has the seal of `lfpiv.hdf5`. A Zarr store has two digests in its attributes: of all bytes of all files,
 and of everything but the values of the variables. The first is checked for stores of up to `WHOLE_BYTES`, the second
@@ -33,7 +33,7 @@ WHOLE_BYTES = 4 << 30
 """Largest store of which all bytes are read when it is opened [byte]; 1 GiB takes about a second."""
 
 OUTLINE, CONTENT = "outline_digest", "content_digest"
-"""Attributes of a complete Zarr store: digest of names, sizes, metadata and axes, and digest of all bytes."""
+"""Attributes of a Zarr store: digest of names, sizes, metadata and axes, and digest of all bytes."""
 
 LARGEST_CHUNK = 64 << 20
 """Largest chunk, and largest coordinate, of a Zarr store [byte]."""
@@ -109,7 +109,7 @@ def zarr_attributes(path: Path) -> dict[str, Any]:
 
 
 def check_zarr(path: Path) -> None:
-    """Check the form of a Zarr store, complete or not. No codec runs.
+    """Check the form of a Zarr store. No codec runs.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def check_zarr(path: Path) -> None:
 
 
 def verify_zarr(path: Path) -> None:
-    """Verify a complete Zarr store, whose form was checked.
+    """Verify a Zarr store, whose form was checked.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def verify_zarr(path: Path) -> None:
 
 
 def zarr_digests(path: Path, *, whole: bool = True) -> dict[str, str]:
-    """Return the attributes that seal a complete Zarr store.
+    """Return the attributes that seal a Zarr store.
 
     Parameters
     ----------

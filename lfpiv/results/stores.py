@@ -1,15 +1,15 @@
 """Stores: the vectors of a run packed into one NetCDF file or one Zarr store, for analysis.
 
 Both are chunked alike: `CHUNK_PAIRS` pairs and a part of the volume, so that a series at a point and a whole field both
-read few chunks. They are written in blocks of one chunk along the pairs, each vector file read once.
+read few chunks. They are written in blocks of one chunk along the pairs, each vector file read once. Each export writes
+all pairs: that takes a thousandth of the time in which they were computed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
-import json
-import logging
 import math
 import re
 import shutil
@@ -26,12 +26,8 @@ from lfpiv.errors import DamagedFile, InputError
 from lfpiv.experiment.pair_range import pair_range
 from lfpiv.files import replacing, replacing_folder
 from lfpiv.progress import StepProgress
-from lfpiv.records import validate
 from lfpiv.results import datasets, netcdf, store_seal
-from lfpiv.results.folder import locked
 from lfpiv.results.stacked_files import INSTANT, PAIR, StackedFiles
-
-log = logging.getLogger(__name__)
 
 CHUNK_PAIRS = 64
 """Largest number of pairs or instants in a chunk."""
@@ -48,10 +44,6 @@ LAYOUT = 1
 
 OLDEST = {"zarr": (3, 1), "xarray": (2025, 6)}
 """Oldest versions of the packages that write and read Zarr stores."""
-
-WRITTEN, SIGNATURE, CHANGED = "written", "signature", "file_changed_ns"
-"""Attributes of a Zarr store: number of pairs that are written, and what they share. Its variable with the time of the
-last change of each vector file [ns]."""
 
 
 def is_store(path: Path) -> bool:
@@ -84,7 +76,7 @@ def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Da
         text = " ".join((error.reason if isinstance(error, DamagedFile) else str(error)).split())[:300]
         raise InputError(f"{path}: expected a store of `lfpiv export`, found {text}. Export again.") from None
     dimension = INSTANT if INSTANT in results.dims else PAIR
-    for name in ("history", FORM, WRITTEN, SIGNATURE, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
+    for name in ("history", FORM, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
         results.attrs.pop(name, None)
     if isinstance(edges := results.attrs.get("voxel_mm"), list):
         results.attrs["voxel_mm"] = np.asarray(edges)
@@ -98,13 +90,7 @@ def _verified(path: Path) -> xr.Dataset:
     chunks: dict[str, int] | None = None if importlib.util.find_spec("dask") is None else {}
     if path.is_dir():
         _require_zarr()
-        stated = store_seal.zarr_attributes(path)
-        _require_form(stated, path)
-        if store_seal.CONTENT not in stated:
-            raise InputError(
-                f"{path}: expected a complete store, found that of an export that was interrupted or goes on. The same "
-                "`lfpiv export` goes on from there."
-            )
+        _require_form(store_seal.zarr_attributes(path), path)
         store_seal.check_zarr(path)
         store_seal.verify_zarr(path)
         results = xr.open_zarr(path, consolidated=False, chunks=chunks, zarr_format=3)
@@ -113,7 +99,6 @@ def _verified(path: Path) -> xr.Dataset:
             _require_form(file.attrs, path)
         store_seal.verify_netcdf(path)
         results = xr.open_dataset(path, engine="h5netcdf", chunks=chunks)
-    results = results.drop_vars(CHANGED, errors="ignore")
     held: xr.Dataset = results.assign_coords({name: values.compute() for name, values in results.coords.items()})
     return held
 
@@ -151,7 +136,7 @@ def write_netcdf(
     pairs, tile = _layout(files)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as scratch, hdf5.written(scratch) as disk, h5netcdf.File(disk, "w") as file:
-        for first, after in _blocks(0, len(files), pairs):
+        for first, after in _blocks(len(files), pairs):
             progress(first / len(files))
             block = _with_times(files.block(first, after), interval_s)
             if first == 0:
@@ -175,88 +160,46 @@ def write_netcdf(
 def write_zarr(
     files: StackedFiles, path: Path, attributes: Mapping[str, Any], interval_s: float | None, progress: StepProgress
 ) -> None:
-    """Write a stack of vector files into a Zarr store of format 3, or add to the store what is new.
-
-    Pairs are written from the first one on that is new or whose file changed. The attributes say how many are written
-    completely, and only a complete store has digests; so a store whose export was killed is not taken for complete, and
-    the next export goes on. A store of other settings is written anew.
+    """Write a stack of vector files into a Zarr store of format 3, which appears when it is complete.
 
     Parameters are those of `write_netcdf`.
 
     Raises
     ------
     InputError
-        If zarr is not installed, another folder is in the way, or another process writes the store.
+        If zarr is not installed, or another folder is in the way.
     OSError
         If the disk is full.
     """
     _require_zarr()
-    with locked(path.with_name(f".{path.name}.lock")):
-        _write_zarr(files, path, attributes, interval_s, progress)
-
-
-def _write_zarr(
-    files: StackedFiles, path: Path, attributes: Mapping[str, Any], interval_s: float | None, progress: StepProgress
-) -> None:
     import zarr
 
+    _require_store(path)
     pairs, tile = _layout(files)
-    identity = json.dumps([files.signature, interval_s, pairs, tile])
-    changed = files.changed_ns()
-    start, complete = _kept(path, identity, files, changed, pairs)
-    if start == len(files) and complete:
-        log.info("%s: has all %d %ss", path, len(files), files.dimension)
-        progress(1.0)
-        return
-    if start:
-        log.info("%s: has %d of %d %ss, the others are added", path, start, len(files), files.dimension)
-        _shorten(path, files.dimension, start)
-    else:
-        shutil.rmtree(path, ignore_errors=True)
-    for first, after in _blocks(start, len(files), pairs):
-        progress(first / len(files))
-        block = _with_times(files.block(first, after), interval_s)
-        block = block.assign_coords({CHANGED: (files.dimension, changed[first:after])})
-        packed = datasets.packed(block, {**attributes, FORM: LAYOUT, SIGNATURE: identity, WRITTEN: first})
-        packed.attrs = _listed(packed.attrs)
-        for variable in packed.variables.values():
-            variable.attrs, variable.encoding = _listed(variable.attrs), {}
-        if first == 0:
-            with replacing_folder(path) as scratch:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing_folder(path) as scratch:
+        for first, after in _blocks(len(files), pairs):
+            progress(first / len(files))
+            packed = datasets.packed(_with_times(files.block(first, after), interval_s), {**attributes, FORM: LAYOUT})
+            packed.attrs = _listed(packed.attrs)
+            for variable in packed.variables.values():
+                variable.attrs, variable.encoding = _listed(variable.attrs), {}
+            if first == 0:
                 encoding = _encoding(packed, files.dimension, (pairs, *tile))
                 packed.to_zarr(scratch, mode="w", consolidated=False, encoding=encoding, zarr_format=3)
-        else:
-            packed.to_zarr(path, append_dim=files.dimension, consolidated=False, zarr_format=3)
-        _group(path).attrs[WRITTEN] = after
-    with warnings.catch_warnings():  # that consolidated metadata are not yet in the specification; xarray asks for them
-        warnings.simplefilter("ignore")
-        group = zarr.consolidate_metadata(str(path), zarr_format=3)
-        group.attrs.update(store_seal.zarr_digests(path))
+            else:
+                packed.to_zarr(scratch, append_dim=files.dimension, consolidated=False, zarr_format=3)
+        with warnings.catch_warnings():  # that consolidated metadata are not yet in the specification
+            warnings.simplefilter("ignore")
+            group = zarr.consolidate_metadata(str(scratch), zarr_format=3)
+            group.attrs.update(store_seal.zarr_digests(scratch))
+        shutil.rmtree(path, ignore_errors=True)
     progress(1.0)
 
 
 def _listed(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     """Return attributes as JSON has them."""
     return {str(name): np.asarray(value).tolist() for name, value in attributes.items()}
-
-
-def _group(path: Path) -> Any:
-    """Open a store to write."""
-    import zarr
-
-    return zarr.open_group(str(path), mode="r+", use_consolidated=False, zarr_format=3)
-
-
-def _shorten(path: Path, dimension: str, length: int) -> None:
-    """Take a store for unfinished, and cut its arrays off along the pairs."""
-    group = _group(path)
-    stated = {
-        name: value for name, value in group.attrs.items() if name not in (store_seal.OUTLINE, store_seal.CONTENT)
-    }
-    group.attrs.put({**stated, WRITTEN: length})
-    for _, array in group.arrays():
-        if dimension in array.metadata.dimension_names and array.shape[0] > length:
-            array.resize((length, *array.shape[1:]))
 
 
 def _layout(files: StackedFiles) -> tuple[int, tuple[int, ...]]:
@@ -271,12 +214,9 @@ def _layout(files: StackedFiles) -> tuple[int, tuple[int, ...]]:
     return pairs, tuple(tile)
 
 
-def _blocks(start: int, total: int, length: int) -> Iterator[tuple[int, int]]:
-    """Yield first and end of blocks that end where chunks end."""
-    while start < total:
-        after = min((start // length + 1) * length, total)
-        yield start, after
-        start = after
+def _blocks(total: int, length: int) -> Iterator[tuple[int, int]]:
+    """Yield first and end of blocks."""
+    return ((first, min(first + length, total)) for first in range(0, total, length))
 
 
 def _with_times(block: xr.Dataset, interval_s: float | None) -> xr.Dataset:
@@ -307,50 +247,16 @@ def _require_zarr() -> None:
             )
 
 
-def _kept(path: Path, identity: str, files: StackedFiles, changed: np.ndarray, length: int) -> tuple[int, bool]:
-    """Return how many of the files a store already has, from the first on, and whether it is complete.
-
-    Blocks of an unfinished store have `length` pairs.
-    """
-    if not path.exists():
-        return 0, False
-    try:
-        own = store_seal.zarr_attributes(path)
-    except DamagedFile:
-        own = {}
-    if FORM not in own and any(path.iterdir()):
-        raise InputError(f"{path}: expected a place for a Zarr store, found another folder. Remove it, or use --out.")
-    if own.get(FORM) != LAYOUT or own.get(SIGNATURE) != identity:
-        return 0, False
-    sealed = store_seal.CONTENT in own
-    for left in () if sealed else path.rglob("*.partial"):
-        left.unlink()  # a killed export was writing it
-    try:
-        store_seal.check_zarr(path)
-        if sealed:
-            store_seal.verify_zarr(path)
-        with xr.open_zarr(path, consolidated=False, chunks=None, zarr_format=3) as stored:
-            both = min(validate(int, own.get(WRITTEN)), len(files))
-            numbers, times = (stored[name].values[:both] for name in (files.dimension, CHANGED))
-            same = (numbers == np.array(files.numbers)[:both]) & (times == changed[:both])
-            kept = int(both if same.all() else same.argmin())
-            kept = kept if sealed else _readable(stored[files.names], files.dimension, kept, length)
-            return kept, sealed and own[WRITTEN] == len(files)
-    except Exception as error:  # readers of damaged stores raise whatever they meet
-        reason = error.reason if isinstance(error, DamagedFile) else f"{type(error).__name__}: {error}"
-        log.warning("%s: damaged, written anew: %s", path, " ".join(reason.split())[:300])
-        return 0, False
-
-
-def _readable(stored: xr.Dataset, dimension: str, kept: int, length: int) -> int:
-    """Return how many pairs an unfinished store has in whole blocks that can be read; it has no digest yet."""
-    whole = kept // length * length
-    for first in range(0, whole, length):
-        try:
-            stored.isel({dimension: slice(first, first + length)}).load()
-        except Exception:  # torn chunks make codecs raise whatever they like
-            return first
-    return whole
+def _require_store(path: Path) -> None:
+    """Refuse a folder that is no Zarr store of an export."""
+    own: Mapping[str, Any] = {}
+    if path.exists():
+        with contextlib.suppress(DamagedFile):
+            own = store_seal.zarr_attributes(path)
+        if FORM not in own and any(path.iterdir()):
+            raise InputError(
+                f"{path}: expected a place for a Zarr store, found another folder. Remove it, or use --out."
+            )
 
 
 def _encoding(packed: xr.Dataset, dimension: str, chunks: tuple[int, ...]) -> dict[str, dict[str, Any]]:
