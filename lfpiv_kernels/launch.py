@@ -96,3 +96,9 @@ def load(kernel: wp.Kernel, device: str) -> None:
                 caches.log_compilation(folder)
         wp.load_module(module, device=device)
         _ready.add((kernel, device))
+
+
+def over_voxels(kernel: wp.Kernel, inputs: list[object], *outputs: wp.array) -> None:
+    """Launch a kernel with a thread per voxel of its outputs."""
+    depth, *plane = outputs[0].shape
+    launch(Call(kernel, depth, inputs, outputs, inner=tuple(plane)))

@@ -140,9 +140,9 @@ class Sample:
         """Mean completeness of the pairs."""
         return float(np.mean([one.completeness for one in self.pairs]))
 
-    def curve(self) -> metrics.ErrorCurve:
+    def curve(self, weight: np.ndarray | float = 1.0) -> metrics.ErrorCurve:
         """Return the error against the part of the measurable region in which it is not exceeded."""
-        return metrics.error_curve(self.length, self.size, 1.0)
+        return metrics.error_curve(self.length, weight * self.size, 1.0)
 
     def statistics(self, weight: np.ndarray) -> dict[str, float]:
         """Return the figures of `figures` that follow from the vectors.
@@ -169,10 +169,8 @@ class Sample:
             "outliers": _mean(self.length > self.outlier_voxel, chosen),
             "outliers_normalised": _mean(self.length > bound, chosen) if np.isfinite(bound) else NAN,
         }
-        for part in figures.PARTS:
-            share = part / max(self.completeness, 1e-12)  # of the kept vectors, who stand for less than the region
-            value = metrics.weighted_quantile(self.length, share, weight * self.size) if share <= 1 + 1e-9 else NAN
-            found[f"error_at_{round(100 * part)}"] = value
+        curve = self.curve(weight)
+        found |= {f"error_at_{round(100 * part)}": curve.bound_at(part) for part in figures.PARTS}
         for number, axis in enumerate("xyz"):
             response = metrics.linear_response(self.measured[:, number], self.true[:, number], chosen)
             found[f"rms_{axis}"] = math.sqrt(_mean(self.error[:, number] ** 2, chosen))

@@ -11,6 +11,7 @@ each node, solve for the step.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -57,7 +58,7 @@ class Residual:
     """SMART's misfit [counts]."""
     unlike: float
     """How much the cameras ask for unlike light: of the mean log(I / P) of a voxel's rays, the standard deviation
-    between the cameras less the mean of all cameras, in squares, weighted by the volume."""
+    between the cameras less the mean of all cameras, in squares, weighted by the volume; NaN where it is not asked."""
 
 
 @dataclass(frozen=True)
@@ -144,11 +145,13 @@ class DisplacementSteps:
         self._part = RayPart(model.weights, part)
         self._scale: np.ndarray | None = None
 
-    def residuals(self, light: np.ndarray, transports: tuple[Transport, Transport]) -> list[Residual]:
-        """Compare the images of both frames by the model with the recorded ones."""
-        return [self._residual(number, light, transport) for number, transport in enumerate(transports)]
+    def residuals(
+        self, light: np.ndarray, transports: tuple[Transport, Transport], *, unlike: bool = False
+    ) -> list[Residual]:
+        """Compare the images of both frames by the model with the recorded ones, and with `unlike` the cameras."""
+        return [self._residual(number, light, transport, unlike) for number, transport in enumerate(transports)]
 
-    def _residual(self, frame: int, light: np.ndarray, transport: Transport) -> Residual:
+    def _residual(self, frame: int, light: np.ndarray, transport: Transport, unlike: bool) -> Residual:
         model, prepared = self.model, self.model.frames[frame]
         volume, equations = model.volume(frame, light, transport), prepared.equations
         stored = model.weights.stored.store(volume)
@@ -159,15 +162,17 @@ class DisplacementSteps:
             exponents = [to_host(equations.exponent_of((one,), on_device)).copy() for one in rays]
             misfit = equations.measured()
         norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
-        gains = [one.camera_gain for one in prepared.images.values()]
+        asked = math.nan
+        if unlike:
+            gains = [one.camera_gain for one in prepared.images.values()]
+            sums = [gain * own for gain, own in zip(gains, model.weights.camera_sums, strict=True)]
+            asked = unlike_light(exponents, sums, stored)
         return Residual(
             volume=volume,
             exponent=model.sieved(model.weights.stored.restore(np.sum(exponents, axis=0))),
             relative=float(np.sqrt(misfit.squares / norm)),
             misfit=misfit.divergence,
-            unlike=unlike_light(
-                exponents, [gain * own for gain, own in zip(gains, model.weights.camera_sums, strict=True)], stored
-            ),
+            unlike=asked,
         )
 
     def gradient(

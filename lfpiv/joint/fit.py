@@ -120,7 +120,7 @@ def fit_pair(
                 nodes, number = first, 0
         if not now.fresh and moved < SETTLED_VOXEL:
             break
-    residuals = movement.residuals(light.values, model.transports(nodes))
+    residuals = movement.residuals(light.values, model.transports(nodes), unlike=True)
     ratio = sum(one.misfit for one in residuals) / alone
     unlike = float(np.sqrt(np.mean([one.unlike**2 for one in residuals])))
     return JointFit(light.values, nodes, done, ratio, model.rho is not None, unlike, residuals)

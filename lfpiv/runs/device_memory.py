@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
@@ -20,12 +19,14 @@ if TYPE_CHECKING:
 def estimate_need(experiment: Experiment, *, weights: bool = True) -> DeviceNeed:
     """Estimate the memory that a process needs on a GPU from the nominal rig, before any image is read.
 
-    Without `weights` no volume is reconstructed, and the memory of the weights is left out.
+    Without `weights` volumes are correlated only.
     """
     from lfpiv.weights.checks import estimate_device_need
+    from lfpiv.weights.memory_left import DeviceNeed, beside_bytes
 
-    need = estimate_device_need(memory.nominal_cameras(experiment), experiment.grid, memory.weights_form(experiment))
-    return need if weights else replace(need, cameras=())
+    if not weights:
+        return DeviceNeed((), beside_bytes((), experiment.grid))
+    return estimate_device_need(memory.nominal_cameras(experiment), experiment.grid, memory.weights_form(experiment))
 
 
 def require(experiment: Experiment, need: DeviceNeed, device: Device, *, sharing: int = 1) -> None:

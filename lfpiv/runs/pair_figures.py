@@ -162,7 +162,7 @@ class PairFigures:
 
 
 _DISPLACEMENTS = ("displacement_x", "displacement_y", "displacement_z")
-_OPTIONAL = ("motion", "residual", *netcdf.OF_IMAGES, "stop")
+_OPTIONAL = ("residual", *netcdf.OF_IMAGES, "stop")
 
 
 def read_figures(path: Path, marks: Marks) -> PairFigures:

@@ -33,7 +33,7 @@ ACCELERATIONS, MEMORIES, FACTORS = (1e-4, 2.0), (1.0, 30.0), (1.0, 10.0)
 particles that overlap are not."""
 DIFFUSE_SPEED = 10.0
 """Standard deviation of a velocity that is not known [voxel/instant]."""
-TELLING_TRACKS, TELLING_INSTANTS = 300, 40
+TELLING_TRACKS, TELLING_POSITIONS = 300, 40
 """Largest number of tracks that callers give to `fit_motion`, and of measured positions of each track that it takes."""
 TELLING_LENGTH = 4
 """Least number of positions of a track that tells the motion."""
@@ -241,7 +241,7 @@ def fit_motion(measured: Measured, start: Motion) -> Motion:
     if len(long) < LEAST_TELLING:
         return start
     some = measured[long]
-    span = slice(int(min(some.length.max(), TELLING_INSTANTS)))
+    span = slice(int(min(some.length.max(), TELLING_POSITIONS)))
     limits = np.log([ACCELERATIONS, MEMORIES, FACTORS])
     figures = []
     for axis in range(some.position.shape[2]):

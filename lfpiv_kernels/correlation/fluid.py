@@ -7,14 +7,103 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from lfpiv_kernels import runtime
-from lfpiv_kernels.correlation import filters_gpu, voxelwise_gpu
+from lfpiv_kernels import native, runtime
+from lfpiv_kernels.correlation import filters_gpu
 from lfpiv_kernels.correlation.memory import empty_volume, on_device
 from lfpiv_kernels.correlation.plan import Triple
+from lfpiv_kernels.launch import over_voxels
 from lfpiv_kernels.transfer import Given, Values, as_given, to_device, to_host
 
 TINY = float(np.finfo(np.float32).tiny)
 """Least share of fluid that a mean is divided by."""
+
+
+wp.set_module_options(native.quiet_options())
+
+
+@wp.kernel
+def _invert(
+    # in
+    flag: wp.array3d(dtype=wp.bool),
+    begin: int,
+    # out
+    flag_out: wp.array3d(dtype=wp.bool),
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    flag_out[z, y, x] = not flag[z, y, x]
+
+
+@wp.kernel
+def _as_numbers(
+    # in
+    flag: wp.array3d(dtype=wp.bool),
+    begin: int,
+    # out
+    number_out: wp.array3d(dtype=float),  # 1 where flagged
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    number_out[z, y, x] = wp.where(flag[z, y, x], 1.0, 0.0)
+
+
+@wp.func
+def _differ(one: wp.array3d(dtype=float), other: wp.array3d(dtype=float), z: int, y: int, x: int):
+    """Return whether just one of two volumes holds solid at a voxel; false outside."""
+    if z < 0 or y < 0 or x < 0 or z >= one.shape[0] or y >= one.shape[1] or x >= one.shape[2]:
+        return False
+    return (one[z, y, x] > 0.5) != (other[z, y, x] > 0.5)
+
+
+@wp.kernel
+def _find_fluid(
+    # in
+    one: wp.array3d(dtype=float),  # solid: above 1/2
+    other: wp.array3d(dtype=float),
+    begin: int,
+    # out
+    fluid_out: wp.array3d(dtype=wp.bool),
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    moved = _differ(one, other, z - 1, y, x) or _differ(one, other, z + 1, y, x)
+    moved = moved or _differ(one, other, z, y - 1, x) or _differ(one, other, z, y + 1, x)
+    moved = moved or _differ(one, other, z, y, x - 1) or _differ(one, other, z, y, x + 1)
+    fluid_out[z, y, x] = not moved and one[z, y, x] <= 0.5 and other[z, y, x] <= 0.5
+
+
+@wp.kernel
+def _in_fluid(
+    # in
+    volume: wp.array3d(dtype=float),
+    fluid: wp.array3d(dtype=wp.bool),
+    begin: int,
+    # out
+    volume_out: wp.array3d(dtype=float),  # 0 elsewhere
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    volume_out[z, y, x] = wp.where(fluid[z, y, x], volume[z, y, x], 0.0)
+
+
+@wp.kernel
+def _level(
+    # in
+    volume: wp.array3d(dtype=float),
+    mean: wp.array3d(dtype=float),  # local mean of the volume, 0 outside the fluid
+    share: wp.array3d(dtype=float),  # local mean of the fluid
+    fluid: wp.array3d(dtype=wp.bool),
+    least: float,
+    begin: int,
+    # out
+    level_out: wp.array3d(dtype=float),
+):
+    layer, y, x = wp.tid()
+    z = begin + layer
+    level = float(0.0)
+    if fluid[z, y, x]:
+        level = volume[z, y, x] - mean[z, y, x] / wp.max(share[z, y, x], least)
+    level_out[z, y, x] = level
 
 
 def flags_on_device(flags: Values) -> wp.array:
@@ -27,7 +116,7 @@ def inverted(flags: Given) -> Given:
     if runtime.device().form == "gpu":
         given = flags_on_device(flags)
         others = empty_volume(given.shape, wp.bool)
-        voxelwise_gpu.run(voxelwise_gpu._invert, [given], others)
+        over_voxels(_invert, [given], others)
         return as_given(others, flags)
     return as_given(~to_host(flags), flags)
 
@@ -37,7 +126,7 @@ def as_numbers(flags: Given) -> Given:
     if runtime.device().form == "gpu":
         flagged = flags_on_device(flags)
         numbers = empty_volume(flagged.shape)
-        voxelwise_gpu.run(voxelwise_gpu._as_numbers, [flagged], numbers)
+        over_voxels(_as_numbers, [flagged], numbers)
         return as_given(numbers, flags)
     return as_given(to_host(flags).astype(np.float32), flags)
 
@@ -57,7 +146,7 @@ def common_fluid(first: Given, second: Given) -> Given:
     if runtime.device().form == "gpu":
         solids = on_device(first), on_device(second)
         fluid = empty_volume(first.shape, wp.bool)
-        voxelwise_gpu.run(voxelwise_gpu._find_fluid, [*solids], fluid)
+        over_voxels(_find_fluid, [*solids], fluid)
         return as_given(fluid, first)
     one, other = to_host(first) > 0.5, to_host(second) > 0.5
     differ = one ^ other
@@ -97,9 +186,9 @@ def levelled(first: Given, second: Given, fluid: Values, window: Triple) -> tupl
 def _levelled(volume: wp.array, fluid: wp.array, share: wp.array, window: Triple) -> wp.array:
     """Return a volume less the local mean of its fluid, on a GPU; `share` is the local mean of the flags."""
     inside, level = empty_volume(volume.shape), empty_volume(volume.shape)
-    voxelwise_gpu.run(voxelwise_gpu._in_fluid, [volume, fluid], inside)
+    over_voxels(_in_fluid, [volume, fluid], inside)
     mean = filters_gpu.local_mean(inside, window, filters_gpu.ZEROS)
-    voxelwise_gpu.run(voxelwise_gpu._level, [volume, mean, share, fluid, TINY], level)
+    over_voxels(_level, [volume, mean, share, fluid, TINY], level)
     return level
 
 

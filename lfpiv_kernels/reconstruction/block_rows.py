@@ -142,14 +142,14 @@ class RowLoops:
         self._rows.voxels = len(scale)
         load(_project, "cpu")  # with the whole module, before threads start
 
-    def scatter(self, volume: wp.array, ray_set: int, first: int, last: int, rays_out: wp.array) -> None:
-        """Project: add the weighted intensities of the voxels to their rays of a set."""
+    def project(self, volume: wp.array, ray_set: int, first: int, last: int, rays_out: wp.array) -> None:
+        """Add the weighted intensities of the voxels to their rays of a set."""
         inputs = [self._rows, volume, ray_set, first]
         wp.launch(_project, dim=last - first, inputs=inputs, outputs=[rays_out], device="cpu")
 
-    def gather(
+    def back_project(
         self, rays: wp.array, active: wp.array, ray_set: int, first: int, last: int, volume_out: wp.array
     ) -> None:
-        """Back-project: add the weighted sum of their rays of a set to the voxels where `active` is not 0."""
+        """Add the weighted sum of their rays of a set to the voxels where `active` is not 0."""
         inputs = [self._rows, rays, active, ray_set, first]
         wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume_out], device="cpu")

@@ -238,7 +238,7 @@ class Projector(RayProjector):
             own = rays[self._places[part] : self._places[part + 1]]
             if loops is not None and ray_set != ALL:
                 own.reshape(-1, edge, edge)[:, ray_set :: self.rows] = 0.0
-                loops.scatter(light, ray_set, first, last, self._parts[part])
+                loops.project(light, ray_set, first, last, self._parts[part])
                 return
             own[:] = 0.0
             inputs, outputs = [self._matrix, light, ray_set, first], [self._parts[part]]
@@ -260,7 +260,7 @@ class Projector(RayProjector):
 
             def gather_part(part, first, last):
                 if loops is not None and ray_set != ALL:
-                    loops.gather(self._parts[part], mask, ray_set, first, last, volume)
+                    loops.back_project(self._parts[part], mask, ray_set, first, last, volume)
                     return
                 inputs = [self._matrix, self._parts[part], mask, ray_set, first]
                 wp.launch(_back_project, dim=last - first, inputs=inputs, outputs=[volume], device=device)

@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from lfpiv_kernels import runtime
 from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
-from lfpiv_kernels.rendering import array_faults, real_optics
+from lfpiv_kernels.rendering import array_faults, real_optics, traced_rays
 from lfpiv_kernels.rendering.render import Matrix, Optics, RenderCamera
 
 SPREAD_RAYS = 4096
@@ -69,7 +69,7 @@ def _real_distance(
     normal = ti.Vector([rotation[0, 2], rotation[1, 2], rotation[2, 2]])
     level = normal.dot(rotation @ (ti.Vector([0.0, 0.0, board[0]]) - offset))
     plane = ti.Vector([normal[0], normal[1], normal[2], level])
-    hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
+    hit = traced_rays.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
     return _to_nearest_dot(rotation.transpose() @ hit + offset, board)
 
 

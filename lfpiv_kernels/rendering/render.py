@@ -16,7 +16,7 @@ from scipy.stats import qmc
 from lfpiv_kernels import runtime
 from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens, pack_lattice
-from lfpiv_kernels.rendering import array_faults, real_optics
+from lfpiv_kernels.rendering import array_faults, real_optics, traced_rays
 
 FIXED = 1 << 20
 """Integer units per count: 20 bits below one count, 43 bits above."""
@@ -197,19 +197,19 @@ def _trace_sources(
                 size * ti.Vector([roll_c * a - roll_s * b, roll_s * a + roll_c * b, rays[ray, 4]])
             )
             if ti.static(glass and not thick):
-                shift = real_optics.apparent_shift(place, shift, u, v, so, plates)
+                shift = traced_rays.apparent_shift(place, shift, u, v, so, plates)
                 place += shift
             m = si / (so - place[2])
             k = m * place[2] / so  # 1 - si/f + si/d without its cancellation
             s, t = k * u - m * place[0], k * v - m * place[1]
             passes = True
             if ti.static(thick):
-                found = real_optics.array_place(place, off, u, v, so, si, plates, aberrations, lens_rays)
+                found = traced_rays.array_place(place, off, u, v, so, si, plates, aberrations, lens_rays)
                 off, passes = ti.Vector([found[0], found[1]]), found[2] > 0.0
                 s, t = s + off[0], t + off[1]
             if ti.static(aberrated):
                 passes = (s * s + t * t) * aberrations[3] ** 2 < real_optics.FIELD_STOP**2
-                error = real_optics.aberration(s, t, u, v, aberrations)
+                error = traced_rays.aberration(s, t, u, v, aberrations)
                 s, t = s + error[0], t + error[1]
             if ti.static(clipped):
                 passes = passes and array_faults.passes(s, t, u, v, radius, faults)

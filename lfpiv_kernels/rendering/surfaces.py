@@ -5,7 +5,7 @@ import numpy as np
 from lfpiv_kernels import runtime
 from lfpiv_kernels.libraries import ti
 from lfpiv_kernels.rays.lattice import Lattice, lens_centre, nearest_lens
-from lfpiv_kernels.rendering import array_faults, real_optics
+from lfpiv_kernels.rendering import array_faults, real_optics, traced_rays
 from lfpiv_kernels.rendering.collect import lens_reach, pixel_samples, ray_of_pixel, widest_spread
 from lfpiv_kernels.rendering.render import Optics, RenderCamera
 
@@ -48,7 +48,7 @@ def _place(
         hit = start + (patch[13] - normal.dot(start)) / normal.dot(slope) * slope
     else:
         plane = ti.Vector([normal[0], normal[1], normal[2], patch[13]])
-        hit = real_optics.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
+        hit = traced_rays.board_hit(s, t, u, v, so, si, plates, aberrations, lens_rays, thick, plane)
     arm = hit - ti.Vector([patch[0], patch[1], patch[2]])
     place = ti.Vector([arm.dot(along), arm.dot(across)])
     if not hit[2] < so:  # the plane meets the ray behind the lens, or never

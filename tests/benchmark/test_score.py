@@ -12,7 +12,8 @@ from support import known_truth
 from lfpiv import metrics
 from lfpiv.benchmark.figures import all_figures, keys_of
 from lfpiv.benchmark.page import cell
-from lfpiv.benchmark.readers import ReadOptions
+from lfpiv.benchmark.readers import ReadOptions, read_result
+from lfpiv.benchmark.sample import Sample, pair_errors
 from lfpiv.benchmark.score import ScoreOptions, report, score_results
 from lfpiv.benchmark.truth import open_truth
 from lfpiv.cli import commands
@@ -119,6 +120,15 @@ def test_hiding_bad_vectors_does_not_lower_the_error_at_equal_completeness(truth
     assert less["error"] < shown["error"]
     assert less["error_at_50"] == pytest.approx(shown["error_at_50"])
     assert np.isnan(less["error_at_90"]) and np.isfinite(shown["error_at_90"])
+
+
+def test_a_draw_of_vectors_measures_as_much_as_they_stand_for(truth, tmp_path):
+    fields = read_result(both_pairs(truth, tmp_path / "result", change=noise_of(3)), truth, ReadOptions())
+    sample = Sample([pair_errors(one, truth) for one in fields], truth)
+    half = (np.arange(len(sample.length)) % 2).astype(float)
+    part, all_of_them = (sample.statistics(weight) for weight in (half, np.ones_like(half)))
+    assert np.isnan(part["error_at_90"]) and np.isfinite(all_of_them["error_at_90"])
+    assert part["median"] < part["error_at_50"] <= sample.length.max()
 
 
 def test_a_lattice_a_little_off_is_scored_in_full(truth, tmp_path):
