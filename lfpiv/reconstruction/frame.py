@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv.reconstruction.dark_voxels import DARK
 from lfpiv.reconstruction.first_guess import checked_guess, multiplicative_guess
 from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.image_preparation import PreparedImage
@@ -119,11 +118,9 @@ class PreparedFrame:
             As `solve`.
         """
         state, sieve = self._start(self._given(first)), self.normalisation.sieve
-        history, left_out = History(self.settings, epochs), DARK if sieve.sigma_voxel == 0 else 0.0
+        history = History(self.settings, epochs)
         with self.equations.locked():
-            made = iterate_epochs(
-                self.equations, state, sieve, partitions=partitions, epochs=epochs, left_out=left_out, time=time
-            )
+            made = iterate_epochs(self.equations, state, sieve, partitions=partitions, epochs=epochs, time=time)
             state, _ = _run_epochs(made, state, history, progress)
             history.scale(*self._part_of_light(partitions[0].subsets))
             volume = sieve(state.coefficients)

@@ -45,7 +45,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv.reconstruction.dark_voxels import leave_out
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.sieve import Sieve
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State
@@ -213,7 +212,6 @@ def iterate_epochs(
     *,
     partitions: Sequence[Partition],
     epochs: int,
-    left_out: float = 0.0,
     time: float = 1.0,
 ) -> Iterator[Epoch]:
     """Iterate over the subsets; yield what each epoch leaves. End early where one subset is left or the misfit rises.
@@ -232,8 +230,6 @@ def iterate_epochs(
         The one to begin with, and those that follow it one by one where subsets conflict.
     epochs : int
         Largest number of epochs.
-    left_out : float
-        Share of the light in the faintest voxels that are left out for good before each epoch but the first one.
     time : float
         Nesterov's t_k at which the momentum begins. From 1 on its exponent grows from 0.
     """
@@ -241,8 +237,6 @@ def iterate_epochs(
     momentum = Momentum(duplicate(coefficients), time, SUBSET_MOMENTUM)
     course = _Course(partitions)
     for epoch in range(epochs):
-        if epoch and left_out > 0:
-            leave_out(coefficients, momentum, left_out)
         partition, start = course.partition, duplicate(coefficients)
         agreement = Agreement(start) if partition.conflict > 0 and epoch + 1 < epochs else None
         equations.begin()

@@ -24,7 +24,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import coefficients
 from lfpiv.sequence.motion_field import FAINTEST, LARGEST_GAIN, MotionField
@@ -62,7 +61,7 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     volume, light = own.volume, float(own.volume.sum(dtype=np.float64))
     if not light > 0:
         return volume
-    bright = volume if own.sieve_voxel > 0 else without_dark(volume, FAINT)
+    bright = volume if own.sieve_voxel > 0 else _bright(volume)
     blurred = own.blurred
     dark = np.float32(DARK_SHARE * np.square(blurred, dtype=np.float64).sum() / blurred.sum(dtype=np.float64))
     place = np.flatnonzero(bright)
@@ -89,6 +88,13 @@ def agreed_guess(own: Reconstruction, others: Mapping[int, Reconstruction], flow
     np.maximum(guess, FAINTEST * guess.max(), out=guess, where=bright > 0)
     guess *= np.float32(light / guess.sum(dtype=np.float64))
     return guess
+
+
+def _bright(volume: np.ndarray) -> np.ndarray:
+    """Return a volume whose faintest voxels, with `FAINT` of its light, are 0."""
+    ordered = np.sort(volume, axis=None)
+    below = np.cumsum(ordered, dtype=np.float64)
+    return np.where(volume >= ordered[np.searchsorted(below, FAINT * below[-1])], volume, np.float32(0))
 
 
 def mean_flow(flows: Sequence[xr.Dataset]) -> xr.Dataset:

@@ -30,7 +30,6 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.reconstruction.dark_voxels import without_dark
 from lfpiv.reconstruction.frame import PreparedFrame
 from lfpiv.reconstruction.result import Reconstruction
 from lfpiv.reconstruction.sieve import coefficients
@@ -201,11 +200,11 @@ class SequenceSolver:
         if roughness(flow) > ROUGHEST:
             return solved(StartedFrom.UNRESOLVED, 1)
         plain = prepared.guess()
-        guess = _concentrated(predicted_guess(previous.volume, plain, flow), plain)
+        guess = predicted_guess(previous.volume, plain, flow)
         misfit = prepared.sampled_misfit(guess)
         if not misfit < prepared.sampled_misfit():
             exchanged = predicted_guess(_exchanged(previous.volume), plain, flow)
-            chance = prepared.sampled_misfit(_concentrated(exchanged, plain))
+            chance = prepared.sampled_misfit(exchanged)
             if not misfit < LEAST_AGREEMENT * chance:
                 return solved(StartedFrom.MISSED, FIRST_SHARE, ratio=misfit / chance if chance > 0 else 1.0)
         return solved(StartedFrom.PREDICTED, ITERATION_SHARE, guess)
@@ -239,7 +238,7 @@ class SequenceSolver:
         others = {} if flow is None else _within_reach(trail, at, roughness(flow))
         if flow is None or not others:
             return alone or own.prepared.solve(progress=progress)
-        guess = _concentrated(agreed_guess(own.found, others, flow), own.found)
+        guess = agreed_guess(own.found, others, flow)
         partition = own.prepared.normalisation.correcting
         after = own.prepared.refine(guess, [partition], epochs=1, time=CORRECTING_TIME, progress=progress)
         return own.found.continued_by(after)
@@ -305,11 +304,6 @@ def predicted_guess(volume: np.ndarray, plain: Reconstruction, flow: xr.Dataset)
     guess: np.ndarray = np.where(own > 0, moved**exponent * np.maximum(own, FAINTEST * own.max()) ** (1 - exponent), 0)
     guess *= np.float32(light / guess.sum(dtype=np.float64))
     return guess
-
-
-def _concentrated(guess: np.ndarray, like: Reconstruction) -> np.ndarray:
-    """Return a first guess without its dark voxels. With a sieve these stay: it spreads light into them anyway."""
-    return guess if like.sieve_voxel > 0 else without_dark(guess)
 
 
 def _within_reach(trail: Sequence[SequenceResult], at: int, rough: float) -> dict[int, Reconstruction]:

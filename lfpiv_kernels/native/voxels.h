@@ -54,16 +54,6 @@ LFPIV_INLINE void darken(int run, int size, const float* volume, float* out) {
     for_voxels(run, size, [=](int k) { out[k] = volume[k] == 0.0f ? 0.0f : out[k]; });
 }
 
-/// Write 1 for voxels with light of at least `least`, else 0; leave the others' light in `light`.
-LFPIV_INLINE void part(int run, int size, float least, float* light, float* active) {
-    for_voxels(run, size, [=](int k) {
-        const float own = light[k];
-        const bool bright = own >= least && own > 0.0f;
-        active[k] = bright ? 1.0f : 0.0f;
-        light[k] = bright ? 0.0f : own;
-    });
-}
-
 /// Return the sum of weight * value^2, float32, from `begin` to `end`, `step` apart, in float64. Add the values to
 /// `added` if it is not null.
 LFPIV_INLINE double sum_squares(const float* weight, const float* values, int begin, int end, int step, float* added) {

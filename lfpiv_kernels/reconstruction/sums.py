@@ -1,9 +1,8 @@
-"""Warp: sums, largest values and quantiles of arrays on the device, whose results stay there until they are read.
+"""Warp: sums and largest values of arrays on the device, whose results stay there until they are read.
 
 Orders are fixed, so that no result depends on the number of threads. On the CPU a thread sums neighbours, and NumPy
 sums what the threads found. On a GPU each of `LANES` threads sums every `LANES`-th element, so that neighbouring
-threads read neighbours; `GROUPS` threads sum what these found, and one thread the rest. Twins: NumPy's sums, and the
-sorted light in `brightest_share`.
+threads read neighbours; `GROUPS` threads sum what these found, and one thread the rest. Twins: NumPy's sums.
 """
 
 import numpy as np
@@ -22,14 +21,6 @@ GROUPS = 128
 """Threads that sum what these found."""
 PIECE = 4096
 """Elements that a thread of the CPU sums."""
-DIGIT = 8
-"""Thresholds that one sweep of `brightest_share` tries on a GPU: a digit of the result's 32 bits, to the base 8."""
-UNSORTED_BITS = 16
-"""Lower bits of the light by which voxels are not told apart at first on the CPU."""
-LAST = 10
-"""The last sweep, after which all bits are known."""
-
-Sums = wp.types.vector(length=DIGIT, dtype=wp.float64)
 
 
 @wp.struct
@@ -125,74 +116,6 @@ def _add_up(
     totals_out[place + first + wp.tid()] += total
 
 
-@wp.func
-def _limit(known: wp.array(dtype=wp.uint64), digit: int, place: int):
-    """Return the bits that begin with the known digits and have `place` as the next one. They rise with the light."""
-    return known[0] + (wp.uint64(place) << wp.uint64(3 * (LAST - digit)))
-
-
-@wp.kernel
-def _sum_below(
-    # in
-    light: wp.array(dtype=float),
-    known: wp.array(dtype=wp.uint64),
-    digit: int,
-    piece: Piece,
-    first: int,
-    # out
-    sums_out: wp.array(dtype=Sums),
-):
-    thread = first + wp.tid()
-    total, begin = Sums(), thread * piece.stride
-    for k in range(begin, _end(piece, begin), piece.step):
-        value = light[k]
-        bits = wp.uint64(wp.cast(value, wp.uint32))
-        for place in range(DIGIT):
-            if bits < _limit(known, digit, place + 1):
-                total[place] += wp.float64(value)
-    sums_out[thread] = total
-
-
-@wp.kernel
-def _sum_vectors(
-    # in
-    values: wp.array(dtype=Sums),
-    piece: Piece,
-    first: int,
-    # out
-    sums_out: wp.array(dtype=Sums),
-):
-    thread = first + wp.tid()
-    total, begin = Sums(), thread * piece.stride
-    for k in range(begin, _end(piece, begin), piece.step):
-        total += values[k]
-    sums_out[thread] = total
-
-
-@wp.kernel
-def _next_digit(
-    # in
-    sums: wp.array(dtype=Sums),
-    share: wp.float64,
-    digit: int,
-    first: int,
-    # out
-    known_out: wp.array(dtype=wp.uint64),
-    all_out: wp.array(dtype=wp.float64),
-    least_out: wp.array(dtype=float),
-):
-    total = Sums()
-    for k in range(sums.shape[0]):
-        total += sums[k]
-    if digit == 0:
-        all_out[0] = total[DIGIT - 1]
-    place = int(0)  # noqa: RUF046 - a variable for Warp
-    while place < DIGIT - 1 and total[place] < share * all_out[0]:
-        place += 1
-    known_out[0] = _limit(known_out, digit, place)
-    least_out[0] = wp.cast(wp.uint32(known_out[0]), float)
-
-
 class Totals:
     """Sums of float64 numbers that stay on the device until they are read together."""
 
@@ -237,38 +160,6 @@ def largest(values: wp.array) -> wp.array:
         launch(Call(_find_largest, threads, [values, _piece(size, threads)], [found]))
         values, size = found, threads
     return values
-
-
-def brightest_share(light: wp.array, share: float) -> wp.array:
-    """Return the light of the faintest voxel that is kept where the faintest, with a share of all light, are left out.
-
-    It stays on the device, shape (1,), float32. Equal voxels are kept or left out together. `light` is >= 0.
-
-    The threshold is the smallest float32 number up to which voxels hold the share. On the CPU it is found in two steps:
-    its upper bits from the light of all voxels by theirs, then by sorting those that have them. On a GPU it is found
-    digit by digit of its bits.
-    """
-    if runtime.device().form == "cpu":
-        return to_device(_threshold(to_host(light), share), float)
-    known, whole, least = zeros(1, wp.uint64), zeros(1, wp.float64), empty(1)
-    lanes, groups = empty(LANES, Sums), empty(GROUPS, Sums)
-    for digit in range(LAST + 1):
-        launch(Call(_sum_below, LANES, [light, known, digit, _piece(light.size, LANES)], [lanes]))
-        launch(Call(_sum_vectors, GROUPS, [lanes, _piece(LANES, GROUPS)], [groups]))
-        launch(Call(_next_digit, 1, [groups, wp.float64(share), digit], [known, whole, least]))
-    return least
-
-
-def _threshold(light: np.ndarray, share: float) -> np.ndarray:
-    """Return the threshold of `brightest_share`, shape (1,)."""
-    upper = light.view(np.uint32) >> UNSORTED_BITS  # in the order of the light, which is >= 0
-    below = np.cumsum(np.bincount(upper, light))
-    wanted = share * below[-1]
-    place = min(max(int(np.searchsorted(below, wanted)), int(upper.min())), len(below) - 1)
-    ordered = np.sort(light[upper == place])
-    within = np.cumsum(ordered, dtype=np.float64) + (below[place - 1] if place else 0.0)
-    at = min(int(np.searchsorted(within, wanted)), len(ordered) - 1)
-    return ordered[at : at + 1].copy()
 
 
 def _piece(size: int, threads: int) -> Piece:

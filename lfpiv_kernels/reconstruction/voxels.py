@@ -77,18 +77,6 @@ def _darken(
 ): ...
 
 
-@native.kernel("lfpiv::part(run, size, least.data[0], light_out.data, active_out.data);")
-def _part(
-    # in
-    least: wp.array(dtype=float),
-    size: int,
-    first_run: int,
-    # out
-    light_out: wp.array(dtype=float),
-    active_out: wp.array(dtype=float),
-): ...
-
-
 def multiply(one: wp.array, other: wp.array, out: wp.array | None = None, *, factor: float = 1.0) -> wp.array:
     """Return one * factor * other; write it to `out` if given."""
     found = empty(one.size) if out is None else out
@@ -118,13 +106,6 @@ def add(added: wp.array, out: wp.array, mask: wp.array | None = None) -> None:
 def darken(out: wp.array, volume: wp.array) -> None:
     """Overwrite `out` by 0 where `volume` is 0."""
     sweep_runs(_darken, [volume], [out])
-
-
-def part_bright(light: wp.array, least: wp.array) -> wp.array:
-    """Return 1 for voxels with light of at least `least`, shape (1,), else 0. Leave the others' in `light`."""
-    active = empty(light.size)
-    sweep_runs(_part, [least], [light, active])
-    return active
 
 
 def ones(size: int) -> wp.array:

@@ -77,6 +77,7 @@ def test_two_workers_share_pairs_and_threads(planned):
     assert f"{math.prod(planned.vectors):,} per pair" in card and "1,000 pairs with 2 workers" in card
 
 
+@pytest.mark.slow
 def test_tracking_is_a_step_of_the_pair(planned, small_run):
     experiment = dataclasses.replace(read_experiment(small_run.experiment), tracking=Tracking(vectors="links"))
     tracked = lfpiv.plan(experiment, pairs=PAIRS, out=small_run.out)

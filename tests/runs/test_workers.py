@@ -284,6 +284,7 @@ def test_without_dask_its_extra_is_named(small_run, tmp_path, monkeypatch):
         pipeline.run(small_run.experiment, small_run.calibrated(tmp_path / "out"), workers=2)
 
 
+@pytest.mark.slow
 def test_finishing_thousands_of_pairs_opens_each_file_at_most_twice(small_run, tmp_path, monkeypatch):
     """A count, no clock: what is there is noticed from the heads of the files, once, and summed up from them, once."""
     pairs, file = 300, small_run.images(tmp_path / "data")

@@ -136,6 +136,7 @@ def test_images_of_other_particles_do_not_fit(rig, shown):
     assert not judged(rig, foreign).fits
 
 
+@pytest.mark.slow(but="2")
 @pytest.mark.parametrize("pair", range(4))
 def test_images_of_another_pair_do_not_fit_however_well_they_are_explained(rig, shown, pair):
     """Images of few particles leave little light: pair 2 beside pair 1 leaves less than others."""

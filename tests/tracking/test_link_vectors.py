@@ -108,6 +108,7 @@ def test_an_incompressible_flow_has_no_divergence():
     assert np.abs(divergence).max() < 1e-6 * np.abs(gradient).max()
 
 
+@pytest.mark.slow(but="4-0.0")
 @pytest.mark.parametrize(("seed", "false"), [(4, 0.0), (5, 0.1)])
 def test_depth_is_found_many_times_better_than_by_a_link(correlated, seed, false):
     vectors = lfpiv.vectors_from_links(correlated, table(*links(120, seed, false=false)))

@@ -103,6 +103,7 @@ def test_nodes_have_rows_as_well(hexagonal, monkeypatch):
         assert np.linalg.norm(light[0] - light[1]) < 0.03 * np.linalg.norm(light[1])
 
 
+@pytest.mark.slow
 def test_particles_are_found_by_rows_better_than_by_halves_of_the_lenses(hexagonal):
     halves = lfpiv.build_weights(hexagonal_rig(), GRID, planes=False)
     rng, truth = np.random.default_rng(4), np.zeros(GRID.shape, np.float32)
