@@ -6,6 +6,7 @@ A question has its option, its text with the unit and the place where the number
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -25,7 +26,7 @@ class Question:
     option: str
     """Option of the command line."""
     form: str
-    """Form of the text, in the help."""
+    """Form of the text, in messages about others."""
     text: str
     """What is asked, with the unit and where the number is found."""
     read: Callable[[str], Any] = str
@@ -46,8 +47,10 @@ class Question:
         try:
             return TypeAdapter(Values.model_fields[self.key].rebuild_annotation()).validate_python(value)
         except ValidationError as error:
-            reason = error.errors()[0]["msg"].removeprefix("Input ").removeprefix("Value error, ")
-            raise ValueError(f"expected {self.form} that {reason}, found {text!r}") from None
+            problem = error.errors()[0]
+            reason = problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+            why = "" if problem["type"] in ("missing", "too_long") else f" ({reason})"  # the form says how many
+            raise ValueError(f"expected {self.form}{why}, found {text!r}") from None
 
 
 def _cameras(text: str) -> tuple[tuple[str, float], ...]:
@@ -57,14 +60,14 @@ def _cameras(text: str) -> tuple[tuple[str, float], ...]:
 
 
 def _product(number: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
-    """Return what reads numbers with "x" between them, such as "7x7"."""
-    return lambda text: tuple(number(part) for part in text.lower().split("x"))
+    """Return what reads numbers with "x", a comma or a blank between them, such as "7x7" or "[7, 7]"."""
+    return lambda text: tuple(number(part) for part in re.split(r"\s*[x,]\s*|\s+", text.lower().strip("[( )]")))
 
 
 def _planes(text: str) -> tuple[float, ...]:
     """Read "-2, -1, 0, 1, 2", or "-2:2:1": first, last and step."""
     if ":" not in text:
-        return tuple(float(part) for part in text.split(","))
+        return tuple(float(part) for part in text.strip("[( )]").split(","))
     first, last, step = (float(part) for part in text.split(":"))
     count = (last - first) / step if step else -1.0
     if not 0 <= count < MOST_PLANES or abs(count - round(count)) > 1e-6:
@@ -87,7 +90,7 @@ QUESTIONS = (
     Question(
         key="cameras",
         option="--cameras",
-        form="NAME=ANGLE,...",
+        form="NAME=ANGLE, NAME=ANGLE, such as left=45, right=-45",
         text="cameras and the angle of each about y [degree], positive on the side of +x, such as left=45, right=-45",
         read=_cameras,
     ),
@@ -128,7 +131,7 @@ QUESTIONS = (
     Question(
         key="dots",
         option="--dots",
-        form="NXxNY",
+        form="two whole numbers, such as 7x7",
         text="number of dots of the board along x and y, such as 7x7",
         read=_product(int),
     ),
@@ -137,7 +140,7 @@ QUESTIONS = (
     Question(
         key="planes_mm",
         option="--planes",
-        form="FIRST:LAST:STEP or Z,Z,...",
+        form="FIRST:LAST:STEP or Z, Z, ..., such as -2:2:0.5",
         text="depths of the planes of the board [mm], read on the stage, such as -2:2:0.5",
         read=_planes,
     ),
@@ -157,7 +160,7 @@ QUESTIONS = (
     Question(
         key="size_mm",
         option="--size",
-        form="XxYxZ",
+        form="three numbers, such as 10x10x6",
         text="size of the volume [mm], which the light fills and all cameras see, such as 10x10x6",
         read=_product(float),
     ),

@@ -235,7 +235,7 @@ def print_demo(summary: dict[str, Any], out: Path) -> None:
     error, largest = found["mean_error_voxel"], found["largest_displacement_voxel"]
     error_speed, largest_speed = (quantity(size * found["voxel_m_per_s"], "m/s", 2) for size in (error, largest))
     total_s = summary["timings_s"]["total"]
-    say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.0f} % valid, {speed:.1f} m/s in the median")
+    say(f"measured  a ring vortex: {found['vectors']:,} vectors, {valid:.1f} % valid, {speed:.1f} m/s in the median")
     say(
         f"error     {error:.2f} voxel ({error_speed}) on average where the flow moves by up to {largest:.1f} voxel "
         f"({largest_speed}); {total_s:.0f} s"
@@ -279,10 +279,10 @@ def print_vectors(summary: dict[str, Any], out: Path) -> None:
     """Print one line per pair, up to `LISTED_PAIRS`."""
     pairs = summary["pairs"]
     for pair in pairs[:LISTED_PAIRS]:
-        say(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.0f} % valid vectors")
+        say(f"{out / 'vectors' / pair['file']}: {100 * pair['valid_fraction']:.1f} % valid vectors")
     if len(pairs) > LISTED_PAIRS:
         count, share = summary.get("pairs_finished", len(pairs)), 100 * summary["valid_fraction"]
-        say(f"{count} {_noun(summary)}s in all, {share:.0f} % valid vectors on average")
+        say(f"{count} {_noun(summary)}s in all, {share:.1f} % valid vectors on average")
 
 
 def print_failed(summary: dict[str, Any], where: TextIO) -> None:

@@ -183,7 +183,8 @@ def _key(location: Location, values: Any) -> str:
 def _listed(places: Sequence[_Place], most: int, values: Any) -> str:
     others = len(places) - most
     keys = dict.fromkeys(_key(place.location, values) for place in places[:most])
-    return ", ".join(keys) + (f" and {others} more" if others > 0 else "")
+    apart = "; " if any("," in key for key in keys) else ", "
+    return apart.join(keys) + (f" and {others} more" if others > 0 else "")
 
 
 def _wanted(problem: Mapping[str, Any]) -> str:

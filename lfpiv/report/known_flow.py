@@ -15,7 +15,7 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.grid import AXES
 from lfpiv.geometry.names import COMPONENTS
-from lfpiv.quantities import quantity
+from lfpiv.quantities import quantity, scale_of
 from lfpiv.report import flow, markup
 from lfpiv.report.flow import Quantity, View
 from lfpiv.report.line_panels import BAND
@@ -205,17 +205,25 @@ def _profile(fields: xr.Dataset, true: xr.Dataset, kinds: dict[str, Quantity], v
 def _table(found: Comparison) -> str:
     """Tabulate the errors of each component."""
     voxel, error, covered = flow.voxel_velocity(found.vectors), found.error_voxel, found.covered
+    rms = np.sqrt((error**2).mean(axis=1))
+    speed = scale_of(float(rms.max()) * voxel, "m/s")
     rows = [
         [
             f"{COMPONENTS[axis]}, along {axis}",
             number(float(error[k].mean()), 3),
-            number(rms := float(np.sqrt((error[k] ** 2).mean())), 3),
-            quantity(rms * voxel, "m/s", 2),
+            number(float(rms[k]), 3),
+            f"{rms[k] * voxel * speed.factor:.3g}",
             markup.NONE if covered is None else percent(float(covered[k])),
         ]
         for k, axis in enumerate("xyz")
     ]
-    titles = ["component", "mean error [voxel]", "rms error [voxel]", "rms error", f"within {BAND:g} stated deviations"]
+    titles = [
+        "component",
+        "mean error [voxel]",
+        "rms error [voxel]",
+        f"rms error [{speed.unit}]",
+        f"within {BAND:g} stated deviations",
+    ]
     text = (
         "Where uncertainties fit, 95 % of the errors lie within two stated standard deviations. A larger share says "
         "that the vectors are better than stated."

@@ -99,7 +99,10 @@ def escape(text: str) -> str:
 
 def number(value: float | None, digits: int) -> str:
     """Format a number with `digits` decimals."""
-    return NONE if value is None or not np.isfinite(value) else f"{value:.{digits}f}".replace("-", "−")
+    if value is None or not np.isfinite(value):
+        return NONE
+    text = f"{value:.{digits}f}"
+    return (text.lstrip("-") if float(text) == 0 else text).replace("-", "−")
 
 
 def general(value: float) -> str:

@@ -153,7 +153,8 @@ def _joint(summary: Summary) -> str:
     text = f"{markup.count(len(fits), 'pair')} of {len(summary.pairs):,}"
     if fits:
         share, ratio = np.mean([fit.share for fit in fits]), np.median([fit.misfit_ratio for fit in fits])
-        text += f"; {percent(float(share))} of the valid vectors; misfit {ratio:.2f} of that of each frame by itself"
+        text += f"; {percent(float(share))} of the valid vectors; one moving volume explains both frames with "
+        text += f"{ratio:.2g} times the misfit of two separate ones"
     return text
 
 
@@ -237,9 +238,15 @@ def timings(summary: Summary, noun: str = "pair") -> str:
         "reconstruction": "reconstruction, all volumes",
         "correlation": f"correlation, all {noun}s",
         "bootstrap": "damping by ghosts",
+        "rest": "checks of cameras and images, size of particles, background",
         "total": "this run, until the report",
     }
-    rows = [[text, quantity(summary.timings_s.get(key), "s")] for key, text in names.items()]
+    times = dict(summary.timings_s)
+    apart = ("calibration", "weights", "reconstruction", "correlation", "bootstrap")
+    rest = (times.get("total") or 0.0) - sum(times.get(key) or 0.0 for key in apart)
+    if rest > 0 and not summary.reused:  # of several workers the parts add up to more than the whole
+        times["rest"] = rest
+    rows = [[text, quantity(times[key], "s")] for key, text in names.items() if key in times]
     reused = ""
     if summary.reused:
         named = ", ".join(summary.reused[:WARNINGS_SHOWN])

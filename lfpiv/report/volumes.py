@@ -20,6 +20,11 @@ from lfpiv.results import netcdf
 
 FEW_VOLUMES = 6
 """Largest number of volumes with a line each in the chart of residuals. Of more, median and range are drawn."""
+LAST_IS_JOINT = (
+    " The last value is after the joint fit, where one moving volume explains both frames; it is larger than before, "
+    "where each frame has a volume of its own."
+)
+"""Sentence on the residuals of image pairs that were fitted jointly."""
 BAND = (5, 95)
 """Percentiles that bound the range drawn over many volumes."""
 
@@ -47,7 +52,8 @@ def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], recording
     if first is None:
         return ""
     parts = ['<h2 id="volumes">Volumes</h2>', _projection_figure(pair, first, recording)]
-    parts.append(quality_figure(pair, first, histories, recording))
+    joint = any(item.joint is not None and item.joint.fitted for item in pairs)
+    parts.append(quality_figure(pair, first, histories, recording, joint))
     parts.append(_images(pairs, recording))
     stops = _stops(pairs, recording)
     if stops:
@@ -107,7 +113,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
 
 
 def quality_figure(
-    pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], recording: Recording = PAIRS
+    pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], recording: Recording = PAIRS, joint: bool = False
 ) -> str:
     """Draw the residuals and the brightness over the depth.
 
@@ -121,6 +127,8 @@ def quality_figure(
         Volume -> residual per iteration.
     recording : Recording
         What was recorded; it names results.
+    joint : bool
+        Whether the last residuals are those after a joint fit of both frames.
 
     Returns
     -------
@@ -132,7 +140,10 @@ def quality_figure(
         panel, table = _residuals(histories)
         shown.append(panel)
         tables.append(table)
-        captions.append("Part of the images that the projections of the volume do not explain, per iteration of SMART.")
+        captions.append(
+            "Part of the images that the projections of the volume do not explain, per iteration of SMART."
+            + (LAST_IS_JOINT if joint else "")
+        )
     profile = first["profile_z"].isel(frame=0).values
     sheet = find_sheet(first["z"].values, profile)
     panel, table = _brightness(

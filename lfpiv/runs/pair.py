@@ -213,7 +213,7 @@ class PairWork(FrameWork):
             write_vectors()
             name = experiment.name_of(files.pair)
             valid, moved = 100 * figures.valid_fraction, figures.moved(experiment.grid.voxel_mm, experiment.dt_s)
-            log.info("%s: %.0f %% of the vectors valid; median movement %s", name, valid, moved)
+            log.info("%s: %.1f %% of the vectors valid; median movement %s", name, valid, moved)
 
         self.write(write)
 

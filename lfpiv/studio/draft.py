@@ -24,6 +24,11 @@ Location = tuple[int | str, ...]
 
 OPTIONAL = ("tracking",)
 """Tables that change what a run does by being there, even when they are empty."""
+UNKNOWN = {
+    "unit": "", "allowed": "empty the field to remove it", "default": "none", "meaning": "No key of lfpiv.",
+    "options": [], "plain": True,
+}  # fmt: skip
+"""What a form shows of a key that the settings do not have."""
 
 
 class Draft:
@@ -141,23 +146,33 @@ class Draft:
 
     def tables(self) -> list[dict[str, Any]]:
         """Return what a form of the file needs: tables, and for each key its range, unit, default and meaning."""
-        found = [_form("", ExperimentTable, "experiment")]
+        found = [self._form("", ExperimentTable, "experiment")]
         for name, field in ExperimentTable.model_fields.items():
             model = _model_of(field.annotation)
             if model is None:
                 continue
             if name == "camera":
                 found += [
-                    _form(f"camera.{number}", model, f"camera {camera.get('name', number)}")
+                    self._form(f"camera.{number}", model, f"camera {camera.get('name', number)}")
                     for number, camera in enumerate(self.values.get("camera", []))
                 ]
             else:
-                found.append(_form(name, model, name.replace("_", " ")))
+                found.append(self._form(name, model, name.replace("_", " ")))
             if name == "volume":
                 for number, solid in enumerate(self.values.get("volume", {}).get("solid", [])):
                     shape = HalfSpace if solid.get("kind") == "half_space" else Box
-                    found.append(_form(f"volume.solid.{number}", shape, f"solid {number}: {shape.__name__}"))
+                    found.append(self._form(f"volume.solid.{number}", shape, f"solid {number}: {shape.__name__}"))
         return found
+
+    def _form(self, path: str, model: type[BaseModel], title: str) -> dict[str, Any]:
+        """Return a table of a form: keys of its model, then keys in the file that no model has."""
+        rows, values = list(_rows(model)), self.get(location_of(path))
+        known = {row["key"] for row in rows} | set(model.model_fields)
+        values = values.items() if isinstance(values, dict) else ()
+        unknown = [key for key, value in values if key not in known and not isinstance(value, dict)]
+        rows += [{**UNKNOWN, "key": key} for key in unknown]
+        rows = [{**row, "id": f"{path}.{row['key']}" if path else row["key"]} for row in rows]
+        return {"path": path, "title": title, "rows": rows, "optional": path in OPTIONAL}
 
     def texts(self) -> dict[str, str]:
         """Return the text of each value by its dotted name; "" where the file does not state it."""
@@ -194,8 +209,3 @@ def _rows(model: type[BaseModel]) -> tuple[dict[str, Any], ...]:
             row | {"meaning": meaning.replace("`", ""), "options": options, "plain": entry.get("type") == "string"}
         )
     return tuple(rows)
-
-
-def _form(path: str, model: type[BaseModel], title: str) -> dict[str, Any]:
-    rows = [{**row, "id": f"{path}.{row['key']}" if path else row["key"]} for row in _rows(model)]
-    return {"path": path, "title": title, "rows": rows, "optional": path in OPTIONAL}

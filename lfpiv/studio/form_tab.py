@@ -8,6 +8,7 @@ from typing import Any
 import trame_client.widgets.html as html
 from trame.widgets import vuetify3 as v3
 
+from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment
 from lfpiv.studio import controls
 from lfpiv.studio.draft import Draft, location_of
@@ -24,7 +25,15 @@ class Form:
         self.session, self.state = session, session.state
         self.state.update(dict.fromkeys(("x_diff", "x_open", "x_checked"), ""))
         self.state.update(
-            {"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_files": [], "x_shown": [0], "x_changed": False}
+            {
+                "x_tables": [],
+                "x_texts": {},
+                "x_wrong": {},
+                "x_elsewhere": [],
+                "x_files": [],
+                "x_shown": [0],
+                "x_changed": False,
+            }
         )
         self.state.change("x_open")(lambda x_open, **_: x_open and session.guarded(self._choose)(x_open))
         self.plain: set[str] = set()
@@ -40,25 +49,34 @@ class Form:
 
     def _changed(self, what: str) -> None:
         """Read the file again after another one was opened; show it again after another tab changed the draft."""
-        session = self.session
+        session, s = self.session, self.state
         if what == "experiment":
-            session.draft = Draft(session.experiment) if session.experiment is not None else None
-            places = session.places
-            self.state.x_files = [{"title": places.name(path), "value": str(path)} for path in places.experiments()]
-            self.state.x_open = str(session.experiment or "")
+            places, session.draft = session.places, None
+            s.x_files = [{"title": places.name(path), "value": str(path)} for path in places.experiments()]
+            s.x_open = str(session.experiment or "")
+            self._show(anew=True)
+            try:
+                session.draft = Draft(session.experiment) if session.experiment is not None else None
+            except InputError as error:
+                s.x_elsewhere = [str(error)]
+                raise
         if what in ("experiment", "draft"):
             self._show(anew=True)
+        if what == "experiment":
+            wrong = [any(row["id"] in s.x_wrong for row in table["rows"]) for table in s.x_tables]
+            s.x_shown = [number for number, is_wrong in enumerate(wrong) if is_wrong] or [0]
 
     def _show(self, *, anew: bool) -> None:
         """Show the draft; `anew` replaces the texts of all fields."""
         draft, s = self.session.draft, self.state
         if draft is None:
-            s.x_tables = []
+            s.x_tables, s.x_wrong, s.x_elsewhere, s.x_changed = [], {}, [], False
             return
         if anew:
             s.x_tables, s.x_texts = draft.tables(), draft.texts()
             self.plain = {row["id"] for table in s.x_tables for row in table["rows"] if row["plain"]}
         s.x_wrong = draft.problems()
+        s.x_elsewhere = [f"{name}: {text}".lstrip(": ") for name, text in s.x_wrong.items() if name not in s.x_texts]
         s.x_changed = draft.changed
         lines = difflib.unified_diff(draft.read.splitlines(), draft.text.splitlines(), "file", "form", lineterm="", n=1)
         s.x_diff = "\n".join(lines)
@@ -112,7 +130,7 @@ class Form:
                 controls.button("Save", (edit, "['save']"), "mdi-content-save", disabled=("!x_changed",), id="x-save")
                 controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",), id="x-undo")
                 controls.button("Add a camera", (edit, "['camera']"), "mdi-camera-plus")
-            html.Div("{{ x_wrong[''] }}", v_if="x_wrong['']", classes="lf-wrong", role="alert")
+            html.Div("{{ text }}", v_for="text in x_elsewhere", key="text", classes="lf-wrong", role="alert")
             html.Div("{{ x_checked }}", v_if="x_checked", classes="lf-note", role="status")
             with v3.VExpansionPanels(multiple=True, v_model=("x_shown",), variant="accordion"):
                 with v3.VExpansionPanel(v_for="table in x_tables", key="table.path + table.title"):
@@ -149,4 +167,5 @@ class Form:
                 ],
             )  # fmt: skip
             html.Div("{{ x_wrong[row.id] }}", v_if="x_wrong[row.id]", classes="lf-wrong", role="alert")
-            html.Div("{{ row.meaning }} {{ row.allowed }}; default: {{ row.default }}", classes="lf-note")
+            meant = "row.default === 'required' ? row.default : 'default: ' + row.default"
+            html.Div(f"{{{{ row.meaning }}}} {{{{ [row.allowed, {meant}].join('; ') }}}}", classes="lf-note")

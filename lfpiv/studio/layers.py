@@ -19,6 +19,8 @@ def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
         spread, stresses = lfpiv.statistics.rms(results), lfpiv.statistics.reynolds_stresses(results)
         energy = lfpiv.statistics.turbulent_kinetic_energy(results).rename("turbulent_kinetic_energy")
         return xr.merge([lfpiv.statistics.mean(results), spread, stresses, energy], compat="override")
+    if int(moment) not in results[dimension].values:
+        raise ValueError(f"{dimension} {moment}: expected one of these results, found none. Choose another.")
     return results.sel({dimension: int(moment)})
 
 
@@ -51,7 +53,7 @@ def trusted(grid: pv.ImageData, replaced: bool, uncertainty: float | None) -> pv
         return grid
     shown = grid.copy(deep=False)
     for name in grid.point_data:
-        if name not in ("valid", "uncertainty"):
+        if name != "valid":
             values = np.array(grid[name])
             values[hidden] = np.nan
             shown[name] = values
@@ -89,7 +91,7 @@ def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.Pol
     return pv.wrap(edges.GetOutput())
 
 
-def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.PolyData:
+def arrows(grid: pv.ImageData, every: int, length: float, colour: str, flagged: bool = False) -> pv.PolyData:
     """Return arrows on every n-th vector along each axis, or on the replaced vectors among them.
 
     The fastest arrow is as long as `length` distances of the arrows.
@@ -102,7 +104,7 @@ def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.P
     cloud = pv.PolyData(np.asarray(grid.points)[chosen]) if len(chosen) else pv.PolyData()
     if not len(chosen):
         return cloud
-    for name in grid.point_data:
+    for name in {"velocity", "speed", colour}:
         cloud[name] = grid[name][chosen]
     fastest = float(np.nanmax(grid["speed"], initial=0.0)) or 1.0
     factor = length * every * min(grid.spacing) / fastest
@@ -111,9 +113,9 @@ def arrows(grid: pv.ImageData, every: int, length: float, flagged: bool) -> pv.P
     )
 
 
-def stream_lines(grid: pv.ImageData, seeds: int) -> pv.PolyData:
+def stream_lines(grid: pv.ImageData, seeds: int, colour: str) -> pv.PolyData:
     """Return streamlines from a number of points in the volume, drawn as tubes."""
-    filled = grid.copy(deep=False)
+    filled = slim(grid, colour)
     filled["velocity"] = np.nan_to_num(grid["velocity"])
     low, high = np.array(grid.bounds[::2]), np.array(grid.bounds[1::2])
     places = low + (high - low) * np.random.default_rng(0).random((seeds, 3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -17,6 +18,8 @@ INK = {"light": "#202327", "dark": "#e6e8ea"}
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "xy"}
 REPLACED = "#8a8f98"
 """Colour of vectors that are replaced."""
+EVEN_TICKS = 0.6
+"""Least side, as a share of the longest, that has ticks at round numbers."""
 SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
 """Fields whose colours are centred on zero."""
 
@@ -29,8 +32,8 @@ class Look:
     """Number of a pair or instant, "mean" or "fluctuations"."""
     colour: str = "speed"
     """Field that colours slices, surface, arrows and streamlines."""
-    colours: str = "viridis"
-    """Name of the colour map."""
+    colours: str = ""
+    """Name of the colour map; "" for coolwarm of signed fields, and viridis of others."""
     limits: tuple[float, float] | None = None
     """Ends of the colour scale; None for the field's own."""
     slices: tuple[float | None, float | None, float | None] = (None, None, 0.0)
@@ -95,8 +98,9 @@ class Picture:
             self.drawn |= {"trusted key": key, "trusted": layers.trusted(whole, look.hide_replaced, look.uncertainty)}
         grid = self.drawn["trusted"]
         limits = look.limits or self.limits(whole, look.colour)
-        ink, paint = INK[look.theme], {"cmap": look.colours, "clim": list(limits), "scalars": look.colour}
-        shade = (look.colour, look.colours, limits, look.theme, title)
+        cmap = look.colours or ("coolwarm" if look.colour in SIGNED else "viridis")
+        ink, paint = INK[look.theme], {"cmap": cmap, "clim": list(limits), "scalars": look.colour}
+        shade = (look.colour, cmap, limits, look.theme, title)
         bar = {
             "title": f"{title}\n", "color": ink, "vertical": False, "fmt": "%.3g", "n_labels": 5,
             "position_x": 0.2, "position_y": 0.02, "width": 0.6, "height": 0.08,
@@ -117,15 +121,16 @@ class Picture:
             shown.opacity, shown.interpolation = look.opacity, "Phong"
         self._layer(
             "arrows", look.arrows and (key, look.arrows, look.length, shade),
-            lambda: layers.arrows(grid, look.arrows, look.length, False), **paint,
+            lambda: layers.arrows(grid, look.arrows, look.length, look.colour), **paint,
         )  # fmt: skip
         self._layer(
             "replaced", look.replaced and (id(whole), look.arrows, look.length),
-            lambda: layers.arrows(whole, max(look.arrows, 1), look.length, True), color=REPLACED,
+            lambda: layers.arrows(whole, max(look.arrows, 1), look.length, "speed", True), color=REPLACED,
         )  # fmt: skip
         self._layer(
-            "lines", look.lines and (key, look.lines, shade), lambda: layers.stream_lines(grid, look.lines), **paint
-        )
+            "lines", look.lines and (key, look.lines, shade),
+            lambda: layers.stream_lines(grid, look.lines, look.colour), **paint,
+        )  # fmt: skip
         for name, style in (("particles", {"point_size": 4.0}), ("tracks", {"line_width": 2.0})):
             cloud = clouds.get(name) if getattr(look, name) else None
             colour = paint if cloud is not None and look.colour in cloud.point_data else {"color": ink}
@@ -161,11 +166,14 @@ class Picture:
         plotter.set_background(ground)
         plotter.add_mesh(grid.outline(), color=ink, name="outline", reset_camera=False, render=False)
         plotter.remove_bounds_axes()
-        plotter.show_bounds(
+        axes = plotter.show_bounds(
             bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=11, n_xlabels=4,
             n_ylabels=4, n_zlabels=3, location="outer", grid=False, ticks="outside", fmt="%.3g", use_3d_text=False,
             render=False,
         )  # fmt: skip
+        sides = np.ptp(np.reshape(grid.bounds, (3, 2)), axis=1)
+        for number in np.flatnonzero(sides > EVEN_TICKS * sides.max()):
+            axes.SetAxisLabels(number, None)  # VTK's own, at round numbers, are too many on short sides
         if plotter.scalar_bars:
             plotter.remove_scalar_bar(render=False)
         scale = pv.DataSetMapper()
@@ -181,7 +189,7 @@ class Picture:
         if view == "oblique":
             camera.azimuth, camera.elevation = 25.0, 20.0
         self.plotter.reset_camera(bounds=bounds, render=False)
-        camera.zoom(0.85)
+        camera.zoom(0.78)
 
     def image(self) -> np.ndarray:
         """Return the picture, shape (rows, columns, 3)."""
@@ -189,14 +197,14 @@ class Picture:
         return np.asarray(self.plotter.screenshot(return_img=True))
 
 
-def script(look: Look, results: str, title: str, camera: Any, size: tuple[int, int]) -> str:
-    """Return a program that draws a look of the results in a folder as the studio does, into ``picture.png``.
+def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tuple[int, int]) -> str:
+    """Return a program that draws a look of results as the studio does: ``picture.png``, then ``picture1.png``.
 
     Parameters
     ----------
     look : Look
-    results : str
-        Folder of a run, or a store.
+    results : sequence of str
+        Folders of runs, or stores, a picture each.
     title : str
         Title of the colour scale.
     camera
@@ -212,22 +220,23 @@ def script(look: Look, results: str, title: str, camera: Any, size: tuple[int, i
     values = "".join(f"    {name}={value!r},\n" for name, value in stated)
     clouds = ""
     if look.particles:
-        table = f"lfpiv.open_particles(RESULTS, pairs=({look.moment}, {look.moment} + 1))"
-        clouds += f'clouds["particles"] = points_of({table}, ("x", "y", "z"))\n'
+        table = f"lfpiv.open_particles(results, pairs=({look.moment}, {look.moment} + 1))"
+        clouds += f'    clouds["particles"] = points_of({table}, ("x", "y", "z"))\n'
     if look.tracks:
         until = look.moment if look.moment.isdigit() else None
-        clouds += f'clouds["tracks"] = track_lines(lfpiv.open_tracks(RESULTS), ("x", "y", "z"), {until})\n'
+        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), ("x", "y", "z"), {until})\n'
     return (
         '"""Draw vectors as they were seen in lfpiv studio. Needs lfpiv and pyvista."""\n\n'
         "from __future__ import annotations\n\nfrom dataclasses import dataclass, field\nfrom typing import Any\n"
         f"{body}\n\nBACKGROUND = {{{own.replace('layers.', '')}\n\n\n"
-        f"RESULTS = {results!r}\nLOOK = Look(\n{values})\n\n"
-        "grid = grid_of(field_at(lfpiv.open_results(RESULTS), LOOK.moment))\n"
-        f"clouds = {{}}\n{clouds}"
-        f"picture = Picture.empty({tuple(size)!r})\n"
-        f"picture.show(grid, LOOK, clouds, {title!r})\n"
-        f"picture.plotter.camera_position = {camera!r}\n"
-        "picture.plotter.renderer.reset_camera_clipping_range()\n"
-        "picture.image()\n"
-        'picture.plotter.screenshot("picture.png")\n'
+        f"RESULTS = {list(results)!r}\nLOOK = Look(\n{values})\n\n"
+        "for number, results in enumerate(RESULTS):\n"
+        "    grid = grid_of(field_at(lfpiv.open_results(results), LOOK.moment))\n"
+        f"    clouds = {{}}\n{clouds}"
+        f"    picture = Picture.empty({tuple(size)!r})\n"
+        f"    picture.show(grid, LOOK, clouds, {title!r})\n"
+        f"    picture.plotter.camera_position = {camera!r}\n"
+        "    picture.plotter.renderer.reset_camera_clipping_range()\n"
+        "    picture.image()\n"
+        '    picture.plotter.screenshot("picture%s.png" % (number or ""))\n'
     )

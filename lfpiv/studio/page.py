@@ -54,10 +54,11 @@ def build(given: Path) -> Session:
             for name, (_, tab) in TABS.items():
                 with html.Div(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
                     tab(session)
-        v3.VSnackbar(
-            "{{ message }}", v_model=("message_shown",), timeout=15000, multi_line=True, location="top", color="error",
-            classes="lf-message",
-        )  # fmt: skip
+        with v3.VSnackbar(
+            "{{ message }}", v_model=("message_shown",), timeout=30000, multi_line=True, location="bottom",
+            color="error", classes="lf-message",
+        ), v3.Template(v_slot_actions=True):  # fmt: skip
+            v3.VBtn("Close", click="message_shown = false", variant="text")
     server.add_protocol_to_configure(delivery.send_at_once)
     session.changed("experiment")
     session.changed("results")

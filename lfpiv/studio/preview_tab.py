@@ -18,6 +18,7 @@ import trame_client.widgets.html as html
 import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.quantities import duration
+from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.studio import controls, layers, look
 from lfpiv.studio.field_names import title_of
 from lfpiv.studio.session import Session
@@ -28,6 +29,8 @@ FEW_VOXELS = 60_000
 AUTOMATIC = ("smart.sieve_voxel", "smart.intensity_cap", "correlation.max_displacement_voxel")
 """Settings that have a value of their own unless a box is ticked."""
 
+TABLES: dict[str, type[Smart | Correlation]] = {"smart": Smart, "correlation": Correlation}
+
 SLIDERS = (
     ("correlation.overlap", "overlap of windows", 0.0, 0.9, 0.05, 0.5),
     ("correlation.max_displacement_voxel", "largest displacement [voxel]", 1.0, 32.0, 0.5, 8.0),
@@ -35,7 +38,7 @@ SLIDERS = (
     ("correlation.intensity_power", "power of intensities", 0.1, 1.0, 0.05, 0.5),
     ("smart.iterations", "iterations", 1, 40, 1, 14),
     ("smart.sieve_voxel", "sieve [voxel]", 0.0, 2.0, 0.05, 0.5),
-    ("smart.intensity_cap", "cap of intensities [counts]", 0.0, 5000.0, 10.0, 0.0),
+    ("smart.intensity_cap", "cap of intensities [median of the brightest pixels]", 0.0, 10.0, 0.1, 1.0),
     ("smart.relaxation", "relaxation", 0.2, 2.5, 0.1, 1.0),
 )
 """Key, label, range, step and first value of each slider."""
@@ -57,8 +60,8 @@ class Preview:
         values = {state_of(key): first for key, _, _, _, _, first in SLIDERS}
         values |= {f"{state_of(key)}_auto": True for key in AUTOMATIC}
         self.state.update(
-            {"t_pair": 0, "t_coarser": 1.0, "t_windows": "", "t_busy": "", "t_before": "", "t_after": "", "t_plan": [],
-             "t_plane": 0.5, "t_colour": "speed", "t_voxels": ""} | values
+            {"t_pair": 0, "t_pairs": 1, "t_coarser": 1.0, "t_windows": "", "t_busy": "", "t_before": "", "t_after": "",
+             "t_plan": [], "t_plane": 0.5, "t_colour": "speed", "t_voxels": ""} | values
         )  # fmt: skip
         self.state.change("t_plane", "t_colour", "theme")(lambda **_: session.guarded(self.draw)())
         self.state.change("t_coarser")(lambda **_: self._tell_voxels())
@@ -70,16 +73,19 @@ class Preview:
         draft, s = self.session.draft, self.state
         if what not in ("experiment", "saved") or draft is None:
             return
-        for key, *_ in SLIDERS:
+        for key, *_, first in SLIDERS:
             value = draft.get(key.split("."))
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                s[state_of(key)] = value
-                if key in AUTOMATIC:
-                    s[f"{state_of(key)}_auto"] = False
+            stated = isinstance(value, int | float) and not isinstance(value, bool)
+            s[state_of(key)] = value if stated else first
+            if key in AUTOMATIC:
+                s[f"{state_of(key)}_auto"] = not stated
         windows = draft.get(("correlation", "windows"))
         s.t_windows = tomlkit.item(windows).as_string() if windows is not None else ""
+        count = draft.get(("particles", "pairs")) or draft.get(("particles", "instants"))
+        s.t_pairs = count if isinstance(count, int) else 1
         if what == "experiment":
             s.t_coarser = round(max(1.0, (self._voxels() / FEW_VOXELS) ** (1 / 3)), 1)
+            self.grids, s.t_before, s.t_after, s.t_plan, s.t_pair = [None, None], "", "", [], 0
         self._tell_voxels()
 
     def _voxels(self) -> float:
@@ -101,9 +107,11 @@ class Preview:
         for key, _, _, _, step, _ in SLIDERS:
             table, name = key.split(".")
             if key in AUTOMATIC and self.state[f"{state_of(key)}_auto"]:
+                found[table][name] = TABLES[table].model_fields[name].default
                 continue
             value = self.state[state_of(key)]
             found[table][name] = int(value) if isinstance(step, int) else float(value)
+        found["correlation"]["windows"] = None
         if str(self.state.t_windows).strip():
             try:
                 windows = tomlkit.parse(f"windows = {self.state.t_windows}").unwrap()["windows"]
@@ -159,13 +167,15 @@ class Preview:
             view.update()
 
     def keep(self) -> None:
-        """Write the settings of the sliders into the form."""
+        """Write the settings of the sliders that differ from the file into the form."""
         draft = self.session.draft
         if draft is None:
             return
         for table, settings in self.changed().items():
             for name, value in settings.items():
-                draft.set((table, name), value)
+                stated, default = draft.get((table, name)), TABLES[table].model_fields[name].default
+                if value != (default if stated is None else stated):
+                    draft.set((table, name), None if value == default else value)
         self.session.told("draft")
         self.state.tab = "experiment"
 
@@ -207,14 +217,22 @@ class Preview:
                     controls.button("Write into the form", guarded(self.keep), id="t-keep")
                     controls.button("Cost of the campaign", guarded(self.plan), disabled=("!!t_busy",))
                 html.Div("{{ line }}", v_for="line in t_plan", key="line", classes="lf-note")
-                controls.slider("t_pair", "pair", 0, 20, 1)
+                html.Div(
+                    "Try measures a pair by correlation on longer voxels: fast, and less accurate than a run. Change a "
+                    "slider and try again: before and after stand side by side.", classes="lf-note",
+                )  # fmt: skip
+                controls.slider("t_pair", "pair", 0, ("t_pairs - 1",), 1, v_if="t_pairs > 1")
                 controls.slider("t_coarser", "voxels longer by", 1.0, 4.0, 0.1)
                 html.Div("{{ t_voxels }}", classes="lf-note")
                 html.H3("Correlation and SMART")
                 with html.Div(classes="lf-slider"):
                     html.Label("windows of the passes [voxel]", for_="t-windows")
                     html.Input(
-                        v_model=("t_windows",), placeholder="[32, 16, 12, 12]", id="t-windows", classes="lf-typed"
+                        v_model=("t_windows",),
+                        placeholder="[32, 16, 12, 12]",
+                        id="t-windows",
+                        classes="lf-typed",
+                        style="grid-column: 1 / -1",
                     )
                 for key, label, low, high, step, _ in SLIDERS:
                     name = state_of(key)
@@ -226,6 +244,6 @@ class Preview:
                 html.H3("Shown")
                 controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01)
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
-            with html.Div(classes="lf-main lf-double"), html.Div(classes="lf-views"):
-                names = [f"{name}: {{{{ t_{name} || 'nothing yet' }}}}" for name in ("before", "after")]
-                self.views = controls.linked(self.pictures, "preview", dict.fromkeys(names, "true"))
+            with html.Div(classes="lf-main lf-double", v_show="t_after"), html.Div(classes="lf-views"):
+                names = [f"{name}: {{{{ t_{name} }}}}" for name in ("before", "after")]
+                self.views = controls.linked(self.pictures, "preview", dict.fromkeys(names, "t_after"))

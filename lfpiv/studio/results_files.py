@@ -102,12 +102,10 @@ class Files:
 
     def copy(self) -> None:
         """Show the script that draws what is seen."""
-        plotter = self.results.pictures[0].plotter
+        plotter, folders = self.results.pictures[0].plotter, self.results.folders
         camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
         size = tuple(plotter.window_size)
-        self.state.r_script = look.script(
-            self.results.wanted, self._folder, title_of(self.state.r_colour), camera, size
-        )
+        self.state.r_script = look.script(self.results.wanted, folders, title_of(self.state.r_colour), camera, size)
         self.state.r_script_shown = True
 
     def buttons(self) -> None:

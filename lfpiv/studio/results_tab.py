@@ -19,7 +19,7 @@ from lfpiv.studio.field_names import LABELS, SURFACES, title_of
 from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
-COLOURS = ("viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
+COLOURS = ("", "viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
 CLOUDS = ("particles", "tracks")
 REST_S = 0.25
 """Time without a change after which a picture is drawn with all its pixels."""
@@ -44,12 +44,13 @@ class Results:
         self.state.update(
             {
                 "r_moment": "0", "r_moments": [], "r_numbers": 0, "r_step": 0, "r_colour": "speed", "r_fields": [],
-                "r_colours": "viridis", "r_own": True, "r_low": 0.0, "r_high": 1.0, "r_on_x": False, "r_on_y": False,
+                "r_colours": "", "r_own": True, "r_low": 0.0, "r_high": 1.0, "r_on_x": False, "r_on_y": False,
                 "r_on_z": True, "r_x": 0.0, "r_y": 0.0, "r_z": 0.0, "r_box": [[0, 1, 0.1]] * 3, "r_surface": "",
                 "r_surfaces": [], "r_level": 0.0, "r_ends": [0.0, 1.0, 0.01], "r_opacity": 0.6, "r_arrows": False,
                 "r_every": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
                 "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
                 "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
+                "r_open": "",
             }
         )  # fmt: skip
         watched = """
@@ -60,10 +61,17 @@ class Results:
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
         self.state.change("r_playing")(lambda **_: session.start(self._play()))
+        self.state.change("r_open")(lambda r_open, **_: r_open and session.guarded(self._choose)(r_open))
         self.files = Files(self)
         session.listeners.append(self._opened)
         session.server.controller.on_client_connected.add(lambda **_: self.request())  # the chart, after the picture
         self._panel()
+
+    def _choose(self, path: str) -> None:
+        found = self.session.places.within(path)
+        if found != self.session.results:
+            self.session.results = found
+            self.session.changed("results")
 
     def _opened(self, what: str) -> None:
         """Open other results."""
@@ -76,6 +84,7 @@ class Results:
         self.state.r_others = [{"title": "nothing", "value": ""}, *others]
         if folder is None:
             return
+        self.state.r_open = str(folder)
         results = self.open(str(folder))
         noun = "instant" if "instant" in results.dims else "pair"
         titles = {str(number): f"{noun} {number}" for number in results[noun].values}
@@ -128,7 +137,8 @@ class Results:
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
         self.state.r_ends = [low, high, (high - low) / 200 or 1.0]
-        self.state.r_level = low + 0.6 * (high - low)
+        least = max(low, 0.0) if name == "q_criterion" else low  # vortices are where Q is positive
+        self.state.r_level = least + (0.2 if name == "q_criterion" else 0.6) * (high - least)
 
     @property
     def wanted(self) -> look.Look:
@@ -184,13 +194,17 @@ class Results:
 
     def draw(self, moving: bool = False) -> None:
         """Draw what the state asks for, in both pictures if two runs are compared; faster while something moves."""
+        wanted, folders = self.wanted, self.folders
+        try:
+            if self.session.results is not None:
+                self.show(wanted)
+        finally:
+            for picture, view in zip(self.pictures, self.views[: len(folders)], strict=False):
+                picture.plotter.set_background(look.BACKGROUND[wanted.theme])
+                picture.plotter.render_window.lfpiv_moving = moving
+                view.update()
         if self.session.results is None:
             return
-        wanted, folders = self.wanted, self.folders
-        self.show(wanted)
-        for picture, view in zip(self.pictures, self.views[: len(folders)], strict=False):
-            picture.plotter.render_window.lfpiv_moving = moving
-            view.update()
         if self.state.r_own:
             low, high = self.pictures[0].limits(self.grid(folders[0], wanted.moment), wanted.colour)
             self.state.r_low, self.state.r_high = float(f"{low:.4g}"), float(f"{high:.4g}")
@@ -256,16 +270,23 @@ class Results:
                 self._view_controls()
                 self.files.buttons()
             with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
-                names = {"{{ results_name }}": "true", "{{ r_other }}": "!!r_other"}
+                other = "{{ r_others.find((run) => run.value === r_other)?.title }}"
+                names = {"{{ results_name }}": "true", other: "!!r_other"}
                 self.views = controls.linked(self.pictures, "results", names, lambda: bool(self.state.r_other))
 
     def _moment_controls(self) -> None:
+        html.Div(
+            "No results yet: start a run in the tab Runs.", v_if="r_others.length < 2 && !results_name",
+            classes="lf-note",
+        )  # fmt: skip
+        controls.choice("r_open", "results", ("r_others.slice(1)",), id="r-open", v_if="r_others.length > 1")
         controls.choice("r_moment", "shown", ("r_moments",), id="r-moment")
         with html.Div(v_if="r_numbers > 1"):
             controls.slider("r_step", "through the series", 0, ("r_numbers - 1",), 1)
             controls.button("{{ r_playing ? 'Stop' : 'Play' }}", "r_playing = !r_playing", id="r-play")
         controls.choice("r_colour", "colour", ("r_fields",), id="r-colour")
-        controls.choice("r_colours", "colour map", (list(COLOURS),))
+        maps = [{"title": name or "viridis, signed fields coolwarm", "value": name} for name in COLOURS]
+        controls.choice("r_colours", "colour map", (maps,))
         controls.switch("r_own", "colours over the field's own range")
         with html.Div(v_if="!r_own"):
             step = ("(r_high - r_low) / 100",)

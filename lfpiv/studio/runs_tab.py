@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from pathlib import Path
 
 import trame_client.widgets.html as html
@@ -39,14 +38,15 @@ class Runs:
     @property
     def out(self) -> Path:
         """Folder of results that is asked for, within the given folders."""
-        base = self.session.experiment.parent if self.session.experiment else self.session.places.roots[0]
-        return self.session.places.within(base / str(self.state.p_out or "results"))
+        return self.session.places.within(str(self.state.p_out or "results"))
 
     def _changed(self, what: str) -> None:
-        """Offer the folder of the open results."""
+        """Offer the folder of the open results, or one beside the experiment file."""
         results, experiment = self.session.results, self.session.experiment
         if what == "results" and results is not None and results.is_dir():
-            self.state.p_out = os.path.relpath(results, experiment.parent) if experiment else str(results)
+            self.state.p_out = self.session.places.name(results)
+        elif what == "experiment" and results is None and experiment is not None:
+            self.state.p_out = self.session.places.name(experiment.parent / "results")
 
     def start(self) -> None:
         """Start the run that is asked for; a finished part in the folder is not repeated."""
@@ -130,7 +130,7 @@ class Runs:
         with html.Div(classes="lf-form"):
             with html.Div(classes="lf-bar"):
                 for name, label, hint in (
-                    ("p_out", "folder of results", "results"), ("p_pairs", "pairs A:B", "all"),
+                    ("p_out", "folder of results", "results"), ("p_pairs", "pairs, such as 0:10", "all"),
                     ("p_workers", "workers", "1"),
                 ):  # fmt: skip
                     v3.VTextField(

@@ -16,7 +16,7 @@ from lfpiv.studio.look import BACKGROUND, INK
 from lfpiv.studio.session import Session
 
 COLOURS = ("#2f81d7", "#d9822b", "#2a9d5c", "#a259c9", "#c0392b", "#0f8b8d")
-SOLID, BOARD = "#8a6d3b", "#d4a017"
+SOLID, BOARD, HANDLE = "#8a6d3b", "#d4a017", "#d92d20"
 SIGNIFICANT = 4
 """Digits of the numbers that dragging writes."""
 
@@ -126,19 +126,22 @@ class Space:
         if p.iren is None:
             return
         if name == "volume":
-            p.add_box_widget(
-                self._box_dragged, bounds=box, rotation_enabled=False, factor=1.0, color=INK[self.state.theme]
-            )
+            self._box_handles(box, INK[self.state.theme])
         elif name.startswith("volume.solid.") and int(name.rpartition(".")[2]) < len(solids):
             solid = solids[int(name.rpartition(".")[2])]
             if solid["kind"] == "box":
-                bounds = rig_space.bounds_of(solid["centre_mm"], solid["size_mm"])
-                p.add_box_widget(self._box_dragged, bounds=bounds, rotation_enabled=False, factor=1.0, color=SOLID)
+                self._box_handles(rig_space.bounds_of(solid["centre_mm"], solid["size_mm"]), SOLID)
             else:
                 p.add_plane_widget(
                     self._plane_dragged, normal=solid["normal"], origin=solid["point_mm"], bounds=box, factor=1.0,
                     normal_rotation=True, color=SOLID, outline_translation=False, interaction_event="end",
                 )  # fmt: skip
+
+    def _box_handles(self, bounds: np.ndarray, colour: str) -> None:
+        widget = self.plotter.add_box_widget(
+            self._box_dragged, bounds=bounds, rotation_enabled=False, factor=1.0, color=colour
+        )
+        widget.GetHandleProperty().SetColor(pv.Color(HANDLE).float_rgb)  # white by itself, as the ground
 
     def _box_dragged(self, box: pv.PolyData) -> None:
         bounds = np.asarray(box.bounds)

@@ -11,14 +11,16 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
+from pydantic import BaseModel, ValidationError
 
 import lfpiv
 from lfpiv.calibration.camera import Calibration
 from lfpiv.errors import InputError
+from lfpiv.experiment import problems
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.geometry.grid import Grid
@@ -29,6 +31,8 @@ from lfpiv.runs.frame_light import pair_light, read_darks
 from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.runs.pair_volumes import Reconstructor
 from lfpiv.settings.processing import Correlation, Smart
+
+Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def with_settings(experiment: Experiment, coarser: float, changed: dict[str, dict[str, Any]]) -> Experiment:
@@ -43,9 +47,18 @@ def with_settings(experiment: Experiment, coarser: float, changed: dict[str, dic
     coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(x, y, z), voxel_mm=edge)
     stated = experiment.smart.model_dump() | changed.get("smart", {})
     measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if stated[key] == "auto"}
-    smart = Smart.model_validate(stated | measured | {"refinement": 1.0, "estimate": "correlation"})
-    correlation = Correlation.model_validate(experiment.correlation.model_dump() | changed.get("correlation", {}))
+    smart = checked(Smart, stated | measured | {"refinement": 1.0, "estimate": "correlation"})
+    correlation = checked(Correlation, experiment.correlation.model_dump() | changed.get("correlation", {}))
     return replace(experiment, grid=coarse, smart=smart, correlation=correlation)
+
+
+def checked(table: type[Settings], values: dict[str, Any]) -> Settings:
+    """Return a table of settings, or raise InputError with what is wrong in it."""
+    try:
+        return table.model_validate(values)
+    except ValidationError as error:
+        (place, text), *_ = problems.explain_each(error, table, values).items()
+        raise InputError(f"{'.'.join(map(str, place))}: {text}") from None
 
 
 def vectors_of(experiment: Experiment, calibration: Calibration, pair: int) -> xr.Dataset:

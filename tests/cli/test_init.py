@@ -131,7 +131,8 @@ def test_without_a_terminal_all_missing_options_are_named(tmp_path, capfd):
         ("--image-flip", "sideways", ["--image-flip", "none, horizontal, vertical or both"]),
         ("--cameras", "left,right", ["--cameras", "NAME=ANGLE"]),
         ("--cameras", "left=45,left=-45", ["camera"]),
-        ("--dots", "7", ["--dots", "NXxNY"]),
+        ("--dots", "7", ["--dots", "expected two whole numbers, such as 7x7, found '7'"]),
+        ("--dots", "1x7", ["two whole numbers, such as 7x7 (greater than or equal to 2), found"]),
         ("--planes", "-1:1:0.3", ["--planes", "FIRST:LAST:STEP"]),
         ("--planes", "0:1:0", ["--planes"]),
         ("--dot-diameter", "1.5", ["dot_diameter_mm smaller than spacing_mm"]),
@@ -143,6 +144,13 @@ def test_wrong_answers_are_named_and_nothing_is_written(tmp_path, capfd, option,
     message = capfd.readouterr().err
     assert message.count("\n") == 1 and all(word in message for word in words), message
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", ["7x8", "7 x 8", "7, 8", "[7, 8]", "7 8"])
+def test_sizes_are_read_as_people_write_them(text):
+    (dots,) = (one for one in questions.QUESTIONS if one.key == "dots")
+    (planes,) = (one for one in questions.QUESTIONS if one.key == "planes_mm")
+    assert dots.value(text) == (7, 8) and planes.value("[-1, 0.5]") == (-1.0, 0.5)
 
 
 def test_a_terminal_is_asked_for_what_is_left_out_until_the_answer_can_be_read(tmp_path, capfd, monkeypatch):

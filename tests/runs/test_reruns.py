@@ -211,7 +211,7 @@ def test_an_unchanged_run_is_answered_without_loading_libraries(recorded):
     for _ in range(2):  # in another folder than the checkout, whose files would be another program
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=out)
         assert done.stdout.splitlines()[-1] == "0 []" and "nothing changed" in done.stderr
-        assert "sigma_nor" in done.stdout and "100 % valid" in done.stdout
+        assert "sigma_nor" in done.stdout and "100.0 % valid" in done.stdout
     after = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert {path.name for path in after if after[path] != before.get(path)} == {"summary.json", ".record.json"}
     again = json.loads((out / "summary.json").read_text())

@@ -8,6 +8,7 @@ import pytest
 import lfpiv
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
+from lfpiv.experiment.opening import read_experiment
 
 ON_THE_LENS_PX = 0.5
 """Largest distance of a lattice's circle from the middle of its microimage [pixel]."""
@@ -71,6 +72,21 @@ def test_every_key_of_the_file_has_a_field_with_its_meaning(draft):
     assert all(row["meaning"] for row in rows) and draft.texts()["camera.1.name"] == "right"
     (voxel,) = [row for row in rows if row["id"] == "volume.voxel_mm"]
     assert voxel["unit"] == "mm" and voxel["default"] == "required"
+
+
+def test_a_key_that_lfpiv_does_not_have_is_shown_and_removed_by_emptying_its_field(draft):
+    draft.write(("volume", "voxel_m"), "0.1", plain=False)
+    assert draft.problems() == {"volume.voxel_m": "unknown key. Did you mean 'voxel_mm'?"}
+    assert "volume.voxel_m" in draft.texts()
+    draft.write(("volume", "voxel_m"), "", plain=True)
+    assert draft.problems() == {} and not draft.changed
+
+
+def test_a_setting_out_of_range_is_told_by_a_trial(draft):
+    from lfpiv.studio import trial
+
+    with pytest.raises(InputError, match="intensity_cap: expected"):
+        trial.with_settings(read_experiment(draft.path), 2.0, {"smart": {"intensity_cap": 2000.0}})
 
 
 def test_cameras_and_solids_are_added_and_removed(draft):

@@ -108,6 +108,30 @@ def test_a_mistake_is_told_as_one_types_and_the_keyboard_saves(page):
     assert "dt_s = 0.002" in (page.folder / "experiment.toml").read_text("utf-8")
 
 
+def test_a_file_with_a_slip_is_told_where_it_was_opened_and_leaves_no_other_form(page):
+    wrong = page.folder / "wrong.toml"
+    wrong.write_text((page.folder / "experiment.toml").read_text("utf-8").replace("[volume]", "[volume"), "utf-8")
+    page.browser.execute_script("trame.state.set('x_open', arguments[0])", str(wrong))
+    until(lambda: "expected the name of a table" in "".join(page.get("x_elsewhere")))
+    assert page.get("x_tables") == []
+    wrong.unlink()
+    page.browser.find_element("css selector", ".lf-message button").click()
+    until(lambda: not page.get("message_shown"))
+    page.browser.execute_script("trame.state.set('x_open', arguments[0])", str(page.folder / "experiment.toml"))
+    until(lambda: page.get("x_tables") and not page.get("x_elsewhere"))
+
+
+def test_sliders_that_were_moved_alone_reach_the_form(page):
+    page.open("preview")
+    page.browser.execute_script("trame.state.update({t_smart_iterations: 9, t_correlation_overlap: 0.75})")
+    page.click("t-keep")
+    until(lambda: page.get("x_changed"))
+    added = [line for line in page.get("x_diff").splitlines() if line.startswith(("+", "-")) and "=" in line]
+    assert added == ["-iterations = 8", "+iterations = 9", "+overlap = 0.75"]  # the file has 8
+    page.browser.execute_script("arguments[0].click()", page.find("x-undo"))
+    until(lambda: not page.get("x_changed"))
+
+
 def test_a_series_plays_and_stops(page):
     page.open("results")
     page.click("r-play")
@@ -133,6 +157,7 @@ def test_a_narrow_page_has_no_part_beside_it(page, theme):
 
 def test_a_run_is_started_and_stopped(page):
     page.open("runs")
+    assert page.get("p_out") == "results"  # of the open results, as the page calls them
     page.browser.execute_script("trame.state.set('p_out', 'again')")
     page.click("p-start")
     until(lambda: page.get("p_status") == "running" and page.get("p_log"), RUN_S)

@@ -43,6 +43,16 @@ def test_a_surface_has_its_level_and_a_plane_its_place(results):
     assert np.allclose(np.asarray(plane.points)[:, 1], 0.1)
     hidden = layers.trusted(grid, True, None)
     assert np.array_equal(np.isnan(hidden["u"]), grid["valid"] < 0.5) and hidden["valid"].min() == 0
+    grid["uncertainty"] = np.arange(grid.n_points, dtype=np.float32)
+    assert np.array_equal(np.isnan(layers.trusted(grid, False, 7.5)["uncertainty"]), grid["uncertainty"] > 7.5)
+
+
+def test_a_pair_that_a_run_does_not_have_is_told(results):
+    import lfpiv
+    from lfpiv.studio import layers
+
+    with pytest.raises(ValueError, match="pair 7: expected one of these results"):
+        layers.field_at(lfpiv.open_results(results), "7")
 
 
 def test_the_script_draws_what_is_seen(results, tmp_path):
@@ -56,10 +66,12 @@ def test_the_script_draws_what_is_seen(results, tmp_path):
     picture.show(layers.grid_of(layers.field_at(lfpiv.open_results(results), "0")), seen, {}, "v [m/s]")
     image = picture.image()
     camera = [tuple(map(float, vector)) for vector in picture.plotter.camera_position]
-    (tmp_path / "script.py").write_text(look.script(seen, str(results), "v [m/s]", camera, (400, 300)), "utf-8")
+    script = look.script(seen, [str(results)] * 2, "v [m/s]", camera, (400, 300))
+    (tmp_path / "script.py").write_text(script, "utf-8")
     subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True, capture_output=True)
-    again = cv2.imread(str(tmp_path / "picture.png"))[..., ::-1]
-    assert image.std() > 10 and np.abs(again.astype(int) - image[..., :3]).mean() < SAME_PICTURE
+    for name in ("picture.png", "picture1.png"):
+        again = cv2.imread(str(tmp_path / name))[..., ::-1]
+        assert image.std() > 10 and np.abs(again.astype(int) - image[..., :3]).mean() < SAME_PICTURE
 
 
 @pytest.mark.browser

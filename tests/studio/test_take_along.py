@@ -138,5 +138,7 @@ def test_particles_tracks_and_a_second_run_are_seen(page, folder):
     left, right = np.hsplit(picture(page), 2)
     assert np.abs(left.astype(int) - right).mean() > OTHER_PICTURE
     page.execute_script("arguments[0].click()", page.find_element(By.ID, "r-turn-left"))
+    page.execute_script("trame.state.set('r_surface', 'q_criterion')")
+    until(lambda: page.execute_script("return trame.state.get('r_level') > 0"))  # where a vortex is
     for half, turned in zip((left, right), np.hsplit(picture(page), 2), strict=True):
         assert np.abs(turned.astype(int) - half).mean() > OTHER_PICTURE

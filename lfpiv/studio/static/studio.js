@@ -76,7 +76,10 @@
           if (mark.kind === 'points') context.fill(); else context.stroke();
           if (mark.names && view.scale > (mark.names_from || 0)) {
             context.font = '12px sans-serif';
+            Object.assign(context, { lineWidth: 3, strokeStyle: 'rgba(14, 16, 19, 0.85)' });  // read on any picture
+            context.strokeText(mark.names[number], x + size + 2, y - size);
             context.fillText(mark.names[number], x + size + 2, y - size);
+            Object.assign(context, { lineWidth: 1.5, strokeStyle: mark.colour });
           }
         });
         context.globalAlpha = 1;
