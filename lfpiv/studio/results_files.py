@@ -105,7 +105,8 @@ class Files:
         plotter, folders = self.results.pictures[0].plotter, self.results.folders
         camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
         size = tuple(plotter.window_size)
-        self.state.r_script = look.script(self.results.wanted, folders, title_of(self.state.r_colour), camera, size)
+        seen = self.results.alike(self.results.wanted)
+        self.state.r_script = look.script(seen, folders, title_of(self.state.r_colour), camera, size)
         self.state.r_script_shown = True
 
     def buttons(self) -> None:

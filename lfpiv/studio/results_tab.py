@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -183,8 +184,16 @@ class Results:
         """Return the folders that are seen: the results, and those they are compared with."""
         return [str(self.session.results), *([self.state.r_other] if self.state.r_other else [])]
 
+    def alike(self, wanted: look.Look) -> look.Look:
+        """Return a look whose colours mean the same in both pictures, if two runs are compared."""
+        if not self.state.r_other or wanted.limits is not None:
+            return wanted
+        grid = self.grid(self.folders[0], wanted.moment)
+        return replace(wanted, limits=self.pictures[0].limits(grid, wanted.colour))
+
     def show(self, wanted: look.Look) -> None:
         """Change the pictures to a look, without sending them."""
+        wanted = self.alike(wanted)
         for folder, picture in zip(self.folders, self.pictures, strict=False):
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:

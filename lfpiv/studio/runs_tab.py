@@ -147,7 +147,7 @@ class Runs:
                     icon, look = f"mdi-{what.replace('resume', 'play')}", {"color": "error"} if what == "stop" else {}
                     controls.button(what.title(), (control, f"['{what}']"), icon, id=f"p-{what}", v_if=when, **look)
                 html.Span(
-                    "{{ p_status === 'none' ? '' : p_status }} {{ p_end }} {{ p_status === 'running' ? p_left : '' }}",
+                    f"{{{{ !{running} ? p_end : p_status }}}} {{{{ p_status === 'running' ? p_left : '' }}}}",
                     id="p-status",
                     role="status",
                 )
