@@ -42,6 +42,10 @@ Device = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
     typer.Option("--device", help="Where kernels run; default: compute.device of the experiment file."),
 ]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", metavar="W", help="Processes that work side by side; default: 1, one per GPU."),
+]
 Debug = Annotated[bool, typer.Option("--debug", help="Show debug messages and tracebacks.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show warnings and errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from lfpiv.cli import benchmark, init, interrupts, questions, terminal
-from lfpiv.cli.app import Device, ExperimentFile, Out, Pairs, app, command
+from lfpiv.cli.app import Device, ExperimentFile, Out, Pairs, Workers, app, command
 from lfpiv.errors import ClusterError, InputError, StorageError, printable
 from lfpiv.reproduce import CASES
 
@@ -36,10 +36,7 @@ def _run(
     pairs: Pairs = ":",
     device: Device = None,
     keep_volumes: Annotated[bool, typer.Option("--keep-volumes", help="Write the volumes too.")] = False,
-    workers: Annotated[
-        int | None,
-        typer.Option("--workers", metavar="N", help="Processes that work side by side; default: 1, one per GPU."),
-    ] = None,
+    workers: Workers = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do the work instead."),
@@ -55,12 +52,11 @@ def _run(
 
         options: dict[str, Any] = {"pairs": selected, "device": device, "keep_volumes": keep_volumes}
         options |= {"workers": workers, "scheduler": scheduler}
-        summary = unchanged.repeat({"experiment": str(experiment), **options}, out)
-        if summary is None:
+        finished = unchanged.repeat({"experiment": str(experiment), **options}, out) or {}
+        if not finished:
             from lfpiv.runs import pipeline
 
-            summary = pipeline.run(experiment, out, **options, progress=progress)
-    finished = summary
+            finished = pipeline.run(experiment, out, **options, progress=progress)
     _output.show(finished, lambda: terminal.print_run(finished, out))
     _end(finished)
 
@@ -77,10 +73,7 @@ def _plan(
         int | None,
         typer.Option("--pairs", metavar="N", help="Number of pairs, or of instants of a series; default: all."),
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option("--workers", metavar="W", help="Processes that work side by side; default: 1, one per GPU."),
-    ] = None,
+    workers: Workers = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Folder of a run, whose calibration and voxels are taken."),
@@ -114,13 +107,10 @@ def _init(
         written = init.write_experiment(experiment, answers)
     except typer.Abort as error:
         raise typer.Exit(_fail(1, "interrupted; nothing is written.", error)) from None
-    result = {"experiment": str(experiment), **written._asdict()}
-    _output.show(result, lambda: terminal.print_init(experiment, written))
+    _output.show({"experiment": str(experiment), **written._asdict()}, lambda: terminal.print_init(experiment, written))
 
 
-@command(
-    "calibrate", "lfpiv calibrate experiment.toml --out results", "lfpiv calibrate experiment.toml --out results --json"
-)
+@command("calibrate", "lfpiv calibrate experiment.toml -o results", "lfpiv calibrate experiment.toml -o results --json")
 def _calibrate(experiment: ExperimentFile, out: Out, device: Device = None) -> None:
     """Calibrate the cameras: first step of a run."""
     with _output.progress() as progress:
@@ -233,9 +223,8 @@ def _export(
         from lfpiv.results.export import export
 
         done = export(folder, to, out=out, pairs=selected, depth_mm=depth, interval_s=interval, progress=progress)
-    written = done.files
+    written, left_out = done.files, [{"what": list(one.what), "why": one.why} for one in done.left_out]
     text = f"export: {written[0]}" if len(written) == 1 else f"export: {len(written)} files in {written[0].parent}"
-    left_out = [{"what": list(one.what), "why": one.why} for one in done.left_out]
     _output.show({"files": [str(path) for path in written], "left_out": left_out}, lambda: terminal.say(text))
 
 
@@ -251,14 +240,12 @@ def _schema(out: Out = Path(".")) -> None:
     from lfpiv.settings.keys import json_schema
     from lfpiv.simulation.scene import Scene
 
-    written = []
-    for name, model in ((SCHEMA, ExperimentTable), ("lfpiv-scene.schema.json", Scene)):
-        written.append(out / name)
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(json_schema(model), written[-1])
-    _output.show(
-        {"files": [str(path) for path in written]}, lambda: terminal.say(f"schema: {written[0]}, {written[1]}")
-    )
+    out.mkdir(parents=True, exist_ok=True)
+    models: dict[Path, type[Any]] = {out / SCHEMA: ExperimentTable, out / "lfpiv-scene.schema.json": Scene}
+    for path, model in models.items():
+        write_json(json_schema(model), path)
+    written = [str(path) for path in models]
+    _output.show({"files": written}, lambda: terminal.say(f"schema: {', '.join(written)}"))
 
 
 @command("studio", "lfpiv studio experiment.toml", "lfpiv studio results", "lfpiv studio --no-browser --port 8100")

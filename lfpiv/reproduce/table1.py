@@ -29,11 +29,7 @@ from lfpiv.simulation.scene import true_mapping
 TITLE = "Table 1: error of the mapping by trainer and depth of the network"
 
 TRAINERS: dict[str, Trainer] = {"LM": levenberg_marquardt, "BR": bayesian_regularisation, "GDM": gradient_descent}
-NAMES = {
-    "LM": "Levenberg-Marquardt",
-    "BR": "Bayesian regularisation",
-    "GDM": "gradient descent with momentum",
-}
+NAMES = {"LM": "Levenberg-Marquardt", "BR": "Bayesian regularisation", "GDM": "gradient descent with momentum"}
 NODES = 10
 """Nodes of each hidden layer."""
 PAPER = {
@@ -200,7 +196,6 @@ def _gaussian_labels(rig: Rig, name: str) -> BoardDots:
 
 
 def _both(fits: Sequence[Fit], key: str = "sigma_nor") -> list[float]:
-    """Return a figure of all cameras' networks."""
     return [fit[key] for fit in fits]
 
 
@@ -285,8 +280,6 @@ def _comparison(best: Best) -> list[dict[str, Any]]:
 
 
 def _tables(deep: Deep, shallow: Sequence[Fit], cameras: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the tables of deep networks, of their true errors, and of shallow networks."""
-
     def beside_paper(trainer: str, layers: int, number: int, sigma_nor: float) -> str:
         if layers not in PAPER[trainer] or number >= 2:
             return f"{sigma_nor:.3g}"
@@ -342,14 +335,12 @@ def _notes(deep: Deep, best: Best) -> list[str]:
         "GDM uses batches of 64 samples and lowers its rate where it stalls. With one step per epoch, on all samples, "
         "deep networks hardly change.",
     ]
-    if worse:
-        notes.append(
-            f"Worse than in the paper: {'; '.join(worse)}. Many layers of ten nodes in a row "
-            "have small gradients. First-order methods hardly change the first layers, second-order methods need many "
-            "epochs."
-        )
-    else:
-        notes.append("No deep network does worse than in the paper.")
+    notes.append(
+        f"Worse than in the paper: {'; '.join(worse)}. Many layers of ten nodes in a row have small gradients. "
+        "First-order methods hardly change the first layers, second-order methods need many epochs."
+        if worse
+        else "No deep network does worse than in the paper."
+    )
     if best.shallow_sigma_nor < best.deep:
         notes.append(
             f"The best shallow network ({_describe(best.shallow)}) does better than any deep one, in seconds: the "
@@ -365,10 +356,11 @@ def _cut_notes(labels: Mapping[str, int], sizes: Sizes) -> list[str]:
         return []
     available = min(labels.values())
     taken = available if sizes.samples is None else min(sizes.samples, available)
+    parameters = sum((a + 1) * b for a, b in itertools.pairwise((5, *(NODES,) * 30, 2)))
     return [
         f"Cut at this scale: deep networks see {taken} of {available} labels, at most {sizes.epochs} epochs (GDM "
         f"{sizes.descent_epochs}) instead of 1000, and {', '.join(map(str, left_out)) or 'no'} layers are left out. "
-        f"Networks of 30 layers have {sum(_parameters((NODES,) * 30))} parameters for {2 * round(0.7 * taken)} "
+        f"Networks of 30 layers have {parameters} parameters for {2 * round(0.7 * taken)} "
         "values; the deepest suffer most from the cut."
     ]
 
@@ -377,11 +369,6 @@ def _describe(entry: Fit) -> str:
     nodes = " + ".join(map(str, entry["hidden"]))
     base = "on a fitted thin lens" if entry["baseline"] == "thin_lens" else "without a thin lens"
     return f"{nodes} nodes {base}, {'Gaussian dots' if entry['estimator'] == 'gaussian' else 'integrated dots'}"
-
-
-def _parameters(hidden: Sequence[int]) -> list[int]:
-    sizes = (5, *hidden, 2)
-    return [(a + 1) * b for a, b in itertools.pairwise(sizes)]
 
 
 def _draw(deep: Deep, shallow: Sequence[Fit], path: Path) -> None:

@@ -226,20 +226,7 @@ class Weights(Shown):
         return self._camera_sums
 
     def sums_of_set(self, name: str, ray_set: int) -> np.ndarray:
-        """Return the sum of each voxel's weights over one camera's pixels that see one set of rays only.
-
-        Parameters
-        ----------
-        name : str
-            The camera.
-        ray_set : int
-            Number of the set.
-
-        Returns
-        -------
-        ndarray, shape (voxel,), float32
-            In stored order.
-        """
+        """Sum each voxel's weights over one camera's pixels that see one set of rays only: (voxel,), stored order."""
         projector, gain = self.projector(name), self.gain(name)
         pixels = projector.see_only(ray_set)
         image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
@@ -247,12 +234,7 @@ class Weights(Shown):
         return projector.back_project(image, sums, ray_set)
 
     def light_of_sets(self, name: str) -> np.ndarray:
-        """Return the light of an evenly lit volume in the pixels of a camera that see one set of rays only.
-
-        Returns
-        -------
-        ndarray, shape (set,), float64
-        """
+        """Return the light of an evenly lit volume in a camera's pixels that see one set of rays only, shape (set,)."""
         projector, gain = self.projector(name), self.gain(name)
         image = projector.project(np.ones(self.grid.size, np.float32), np.zeros_like(gain))
         pixels = [projector.see_only(number) for number in range(projector.ray_sets)]
