@@ -131,6 +131,7 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     surface = liquid_surface(dots, lens, setup.optics)
     if contradictions.doubtful(setup, dots, lens, surface) and (text := cause(lens)):
         raise InputError(text)
+    checks.check_focus(experiment, setup, dots)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens, surface=surface)
 
