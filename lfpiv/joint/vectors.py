@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy import ndimage
 from threadpoolctl import threadpool_limits
 
 from lfpiv.geometry.grid import AXES
@@ -45,6 +46,10 @@ that is left between them add in squares, and the factor of both where particles
 UNLIKE_SHARE = 2.7
 """Part of the uncertainty of the frames by themselves that is added in squares, times how much the cameras ask for
 unlike light."""
+EDGE_VOXEL = 1
+"""Error of the edge of a region without particles, where it is found and not stated [voxel]."""
+LEAST_PART = 0.25
+"""Least wet part of a window that its uncertainty is divided by: the field beside a wall has one side only."""
 FARTHEST_VOXEL = 0.5
 """Displacement that is left above which they contradict in any case [voxel]."""
 FIELD_CORRELATION_VOXEL = 5.9
@@ -80,7 +85,9 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
         fluid with particles in the window. It is false where the frames by themselves contradict the fit and their
         correlation gives the vector.
         ``uncertainty_z``, ``_y``, ``_x`` of fitted vectors combine the uncertainty of the frames by themselves, lowered
-        as the fit lowers the error, with the displacement that is left between these frames. ``valid`` is taken from
+        as the fit lowers the error, with the displacement that is left between these frames. Beside a wall they are
+        divided by the part of the window that is fluid with particles, since the fit sees one side only. A wall that is
+        found, not stated, adds what a shift by a voxel changes. ``valid`` is taken from
         the correlation of these frames, ``correlation`` and ``peak_ratio`` from the same frames deformed by the fitted
         displacement. Errors of fitted vectors that lie r_z, r_y, r_x voxels apart correlate as the product of
         ``exp(-(r / L)^2)`` over the axes. The attribute ``error_correlation_voxel`` has L along z, y and x.
@@ -110,6 +117,10 @@ class Evidence:
 
     fitted: np.ndarray
     """Mean of the fitted displacement over the part of the window that is fluid and holds particles; 0 without."""
+    part: np.ndarray
+    """This part of the window, shape (z, y, x, 1)."""
+    edge: np.ndarray
+    """Change of this mean if a region without particles, as found, is smaller by `EDGE_VOXEL`."""
     left: np.ndarray
     """Displacement that is left between the frames by themselves."""
     scatter: np.ndarray
@@ -132,13 +143,15 @@ def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequenc
     moved = np.stack([volumes[0][MOVED[axis]].values for axis in AXES], -1)
     solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
     empty = unseeded_voxels([one.values for one in alone], solid)
-    dry = without(solid, None if empty is None else ~empty)
-    part = np.ones((*moved.shape[:3], 1)) if dry is None else (~dry[..., None]).astype(float)
-    fitted = moved * part
-    for axis, name in enumerate(AXES):
-        share = window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
-        fitted, part = (np.moveaxis(np.tensordot(share, one, (1, axis)), 0, axis) for one in (fitted, part))
-    fitted = np.divide(fitted, part, out=np.zeros_like(fitted), where=part > 0)
+    shares = [
+        window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
+        for axis, name in enumerate(AXES)
+    ]
+    fitted, part = _means(moved, without(solid, None if empty is None else ~empty), shares)
+    edge = np.zeros_like(fitted)
+    if empty is not None:
+        smaller = ndimage.binary_erosion(empty, iterations=EDGE_VOXEL, border_value=1)
+        edge = np.abs(_means(moved, without(solid, ~smaller), shares)[0] - fitted)
     missing = missing_smoothing(settings.smoothing_voxel, *alone)
     first, second = (
         preprocess((one.values - np.median(one.values)).astype(np.float32), missing, settings.intensity_power)
@@ -160,11 +173,25 @@ def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequenc
     )
     return Evidence(
         fitted=fitted,
+        part=part,
+        edge=edge,
         left=left.displacement,
         scatter=scatter,
         correlation=left.correlation,
         peak_ratio=peak_ratio(left),
     )
+
+
+def _means(moved: np.ndarray, dry: np.ndarray | None, shares: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means of a displacement (z, y, x, 3) over the wet part of windows, 0 without, and this part.
+
+    `shares` has the matrix of each axis from voxels to means over windows.
+    """
+    part = np.ones((*moved.shape[:3], 1)) if dry is None else (~dry[..., None]).astype(float)
+    mean = moved * part
+    for axis, share in enumerate(shares):
+        mean, part = (np.moveaxis(np.tensordot(share, one, (1, axis)), 0, axis) for one in (mean, part))
+    return np.divide(mean, part, out=np.zeros_like(mean), where=part > 0), part
 
 
 def _predictor(moved: np.ndarray) -> Predictor:
@@ -182,6 +209,7 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, about: Mapping[str, Any]) -
     stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
     shared = ALONE_SHARE**2 + (UNLIKE_SHARE * float(about.get("unlike", 0.0))) ** 2  # of a file it is a NumPy scalar
     fitted = np.sqrt(shared * stated**2 + (LEFT_SHARE * evidence.left) ** 2) * (LOSSY if about.get("lossy") else 1.0)
+    fitted = np.hypot(fitted / np.maximum(evidence.part, LEAST_PART), evidence.edge)
     merged = with_displacement(vectors, displacement, np.where(joint[..., None], fitted, stated))
     found = {
         name: vectors[name].copy(data=np.where(joint, deformed, vectors[name].values).astype(np.float32))

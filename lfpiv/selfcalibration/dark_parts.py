@@ -27,7 +27,8 @@ CELLS = 12
 DARK = 0.25
 """Largest root of a dark region's light, over the root of the expected light."""
 LEAST_SHARE = 0.1
-"""Least share of a sensor's expected light in a dark region, both as roots."""
+"""Least share of a sensor's expected light in a dark region: what other cameras smear beyond an edge of the seeding is
+dim, and its root would look large."""
 LARGEST_SHARE = 0.75
 """Largest share: the rest is what the region is compared with."""
 BLOCK = 3
@@ -85,13 +86,13 @@ class _Cells:
 
         Roots make cells alike whose particles are unequal. Light outside a rectangle gives the scale of the projection.
         """
-        seen, expected = (np.sqrt(np.maximum(light, 0)) for light in (seen, expected))
         rows, columns = (np.triu_indices(size + 1, 1) for size in self._shape)
+        share = _sums(expected, rows, columns) / expected.sum()
+        seen, expected = (np.sqrt(np.maximum(light, 0)) for light in (seen, expected))
         inside, due = (_sums(light, rows, columns) for light in (seen, expected))
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = (seen.sum() - inside) / (expected.sum() - due)
             lack = (scale * due - inside) / np.sqrt(scale * due)
-            share = due / expected.sum()
             lack[~((share >= LEAST_SHARE) & (share <= LARGEST_SHARE) & (inside <= DARK * scale * due))] = 0
         at = np.unravel_index(lack.argmax(), lack.shape)
         if not lack[at] > 0:

@@ -20,8 +20,10 @@ PARTICLES = 64
 """Number of particles over which light is averaged. At a corner of the volume an eighth of them is left."""
 DARK = 0.05
 """Largest mean light of an empty place, as a share of that where most of the moving light is."""
-EDGE = 1.645
-"""Distance from a straight edge at which a Gaussian mean falls to `DARK`, as a multiple of its standard deviation."""
+EDGE, REACH = 0.5, 2.0
+"""Largest mean light of an empty place around nearly dark ones, and its largest distance from them [standard deviation
+of the Gaussian mean]. At a straight edge the mean falls to a half, and to `DARK` 1.645 standard deviations beyond it,
+or farther where ghosts stand beside the edge."""
 BRIGHT = 95
 """Percentile of the local maxima to which intensities are limited, so that reflections weigh little."""
 CELLS = 2.0
@@ -73,10 +75,11 @@ def unseeded_voxels(volumes: Sequence[np.ndarray], without: np.ndarray | None = 
     level = _level(binned, moving, room, sigma / cell)
     filled = float((level * room).sum() ** 2 / (level**2 * room).sum() / room.sum())
     sigma = _averaging(extent * filled, min(counts))  # particles are closer where they do not fill the volume
-    core = (_level(binned, moving, room, sigma / cell) < DARK) & (room > 0)
+    level = _level(binned, moving, room, sigma / cell)
+    core = (level < DARK) & (room > 0)
     if not core.any():
         return None
-    empty = ndimage.distance_transform_edt(~core) <= EDGE * sigma / cell
+    empty = (level < EDGE) & (ndimage.distance_transform_edt(~core) <= REACH * sigma / cell)
     nearest = (np.minimum(np.arange(n) // cell, m - 1) for n, m in zip(shape, empty.shape, strict=True))
     flags: np.ndarray = empty[np.ix_(*nearest)]
     return flags

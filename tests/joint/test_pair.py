@@ -19,6 +19,8 @@ GRID = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.4, 2.2, 2.0
 WINDOWS = (16, 12, 12)
 CORRELATION = {"windows": WINDOWS}
 BLOB = 0.7
+EDGE_VOXELS = 2.0
+"""Largest error of the edge of a region without particles [voxel]: it is found from a mean over 64 particles."""
 BETWEEN_NODES_MM = 1e-3
 """Largest error of a displacement that is interpolated between voxels, and beyond them by a spline [mm]."""
 GAIN = 0.7
@@ -144,11 +146,35 @@ def test_a_vector_is_the_mean_over_the_fluid_in_its_window(fitted):
     ramp = 0.01 * np.broadcast_to(np.arange(GRID.shape[2], dtype="f4"), GRID.shape)
     masked[0] = masked[0].assign_coords({MOVED["x"]: (volumes[0].dims, np.where(solid, 5, ramp).astype("f4"))})
     vectors = lfpiv.correlate(*alone, **CORRELATION)
-    found = compare(vectors, masked, alone).fitted[..., 2]
+    evidence = compare(vectors, masked, alone)
+    found = evidence.fitted[..., 2]
     for column, centre in enumerate((vectors["x"].values - GRID.axis_mm(2)[0]) / GRID.voxel_mm):
-        part = np.clip((WINDOWS[-1] + 1) / 2 - np.abs(np.arange(GRID.shape[2]) - centre), 0, 1) * ~solid[0, 0]
+        whole = np.clip((WINDOWS[-1] + 1) / 2 - np.abs(np.arange(GRID.shape[2]) - centre), 0, 1)
+        part = whole * ~solid[0, 0]
         np.testing.assert_allclose(found[..., column], (ramp[0, 0] * part).sum() / part.sum(), rtol=1e-5)
+        np.testing.assert_allclose(evidence.part[..., column, 0], part.sum() / whole.sum(), rtol=1e-5)
+    assert not evidence.edge.any(), "a wall that is stated has no error"
     assert 0 < vectors["fluid_share"].values.min() < 1, "a window beside the wall"
+
+
+def test_where_no_particles_are_found_the_displacement_does_not_count_and_the_edge_is_uncertain():
+    """As beside a wall that is not stated; its edge is known to a voxel."""
+    grid, window, gradient = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(4, 4, 4), voxel_mm=0.1), 12, 0.1
+    positions = np.random.default_rng(7).uniform((0, -2, -2), 2, (2000, 3))  # all beyond x = 0
+    light = metrics.truth_volume(positions, np.ones(len(positions)), grid, BLOB)
+    ramp = np.broadcast_to(gradient / grid.voxel_mm * grid.axis_mm(2).astype("f4"), grid.shape)
+    moved = {MOVED[axis]: (light.dims, ramp if axis == "x" else np.zeros_like(ramp)) for axis in "zyx"}
+    volume = light.assign_coords({UNSHARED: (light.dims, light.values)} | moved)
+    vectors = lfpiv.correlate(light, light, windows=[window])
+    evidence = compare(vectors, (volume, volume), (light, light))
+    centre = vectors["x"].values / grid.voxel_mm
+    lit, beside = centre > window / 2 + EDGE_VOXELS, np.abs(centre) < 1
+    assert beside.any() and lit.any()
+    np.testing.assert_allclose(evidence.part[..., lit, 0], 1, rtol=1e-6)
+    assert np.abs(evidence.edge[..., lit, :]).max() < 1e-6
+    middle = gradient * (centre + window / 2)[beside] / 2
+    assert np.abs(evidence.fitted[..., beside, 2] - middle).max() < gradient * EDGE_VOXELS / 2
+    assert np.abs(evidence.edge[..., beside, 2] - gradient / 2).max() < gradient / 4
 
 
 def test_frames_by_themselves_are_correlated_as_ever(weights, pair):

@@ -11,6 +11,10 @@ from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.selfcalibration.dark_parts import find
 from lfpiv.weights.operator import Weights
 
+PARTICLES = 2e-2
+"""Particles per voxel."""
+SEEDED = 0.6
+"""Part of the volume's width that holds particles."""
 WIDER = 1.5
 """Width of a volume that particles do not fill, over their own."""
 
@@ -75,3 +79,13 @@ def test_sound_images_have_no_dark_part_even_in_a_volume_that_they_do_not_fill(r
     grid = rig[0].grid
     wide = grid.padded(grid.layers((0.0, 0.0, (WIDER - 1) / 2 * np.ptp(grid.axis_mm(2)))))
     assert not find(lfpiv.build_weights(rig[1], wide), pairs)
+
+
+def test_a_part_of_the_volume_without_particles_is_not_dark_although_other_views_smear_into_it(weights):
+    rng, shape = np.random.default_rng(1), weights.grid.shape
+    frames = []
+    for _ in range(2):
+        lit = rng.random(shape) < PARTICLES
+        lit[:, :, int(SEEDED * shape[2]) :] = False
+        frames.append({name: 1e3 * image for name, image in weights(lit.astype(np.float32)).items()})
+    assert not find(weights, [frames])
