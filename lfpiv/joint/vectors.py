@@ -191,7 +191,8 @@ def _means(moved: np.ndarray, dry: np.ndarray | None, shares: Sequence[np.ndarra
     mean = moved * part
     for axis, share in enumerate(shares):
         mean, part = (np.moveaxis(np.tensordot(share, one, (1, axis)), 0, axis) for one in (mean, part))
-    return np.divide(mean, part, out=np.zeros_like(mean), where=part > 0), part
+    mean = np.divide(mean, part, out=np.zeros_like(mean), where=part > 0)
+    return mean, np.ones_like(part) if dry is None else part
 
 
 def _predictor(moved: np.ndarray) -> Predictor:
