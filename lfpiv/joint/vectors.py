@@ -210,7 +210,8 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, about: Mapping[str, Any]) -
     stated = np.stack([vectors[f"uncertainty_{axis}"].values for axis in AXES], -1)
     shared = ALONE_SHARE**2 + (UNLIKE_SHARE * float(about.get("unlike", 0.0))) ** 2  # of a file it is a NumPy scalar
     fitted = np.sqrt(shared * stated**2 + (LEFT_SHARE * evidence.left) ** 2) * (LOSSY if about.get("lossy") else 1.0)
-    fitted = np.hypot(fitted / np.maximum(evidence.part, LEAST_PART), evidence.edge)
+    part, edge = (one.astype(fitted.dtype) for one in (evidence.part, evidence.edge))
+    fitted = np.hypot(fitted / np.maximum(part, fitted.dtype.type(LEAST_PART)), edge)
     merged = with_displacement(vectors, displacement, np.where(joint[..., None], fitted, stated))
     found = {
         name: vectors[name].copy(data=np.where(joint, deformed, vectors[name].values).astype(np.float32))
