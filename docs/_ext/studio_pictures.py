@@ -1,7 +1,7 @@
 """Take the pictures of the studio that the pages show: ``python docs/_ext/studio_pictures.py FOLDER``.
 
-FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. A run into a folder "again" beside the
-experiment is begun anew. Each tab is seen by headless Chromium, 1440 pixels wide in light and dark, and 390 pixels
+FOLDER holds an experiment and its finished results, as `lfpiv demo` writes them. A run into a folder "again" beside
+FOLDER is begun anew. Each tab is seen by headless Chromium, 1440 pixels wide in light and dark, and 390 pixels
 wide in light.
 """
 
@@ -28,15 +28,15 @@ TABS = {
 """Name of a tab -> a value of the state that is there when it is drawn, and values that are set for the picture."""
 CLICKED = {"preview": ("t-try", "t_after", 0), "runs": ("p-start", "p_stages", 2)}
 """Name of a tab -> a button that is clicked at first, a value of the state, and the length that it passes."""
-LONGEST_S, SETTLED_S = 150.0, 4.0
-"""Longest time until a tab is drawn, and time after that until its picture is taken [s]."""
+LONGEST_S, TAKEN_S, SETTLED_S = 400.0, 1.0, 4.0
+"""Longest time until a tab is drawn, time until values are taken, and time until its picture is taken [s]."""
 
 
 def take(folder: str) -> None:
     """Take all pictures."""
     command = [sys.executable, "-m", "lfpiv", "studio", folder, "--no-browser"]
     OUT.mkdir(parents=True, exist_ok=True)
-    for earlier in Path(folder).rglob("again/.run.log"):
+    for earlier in Path(folder).resolve().parent.glob("again/.run.log"):
         shutil.rmtree(earlier.parent)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
@@ -69,6 +69,7 @@ def see(driver: webdriver.Chrome, address: str) -> None:
                 wait(driver, f"{opened}; const v = trame.state.get('{ready}'); return !!v && v.length !== 0")
                 for name, value in values.items():
                     driver.execute_script("trame.state.set(arguments[0], arguments[1])", name, value)
+                time.sleep(TAKEN_S)
                 button, shown, parts = CLICKED.get(tab, ("", "", 0))
                 if button and not driver.execute_script(f"return (trame.state.get('{shown}') || []).length"):
                     click(driver, button)

@@ -6,7 +6,7 @@ The run's own steps are done on larger voxels, which takes seconds. Only the pic
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,14 +23,13 @@ from lfpiv.lightfield.saturation import saturated_share
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.intensity_cap import PEAK_SIGMA, typical_peak
 from lfpiv.report.preview import Level, Preview, draw
-from lfpiv.runs import guard, rig
+from lfpiv.runs import coarse, rig
 from lfpiv.runs.frame_light import FrameLight, pair_light, read_darks
-from lfpiv.runs.pair_volumes import Reconstructor
-from lfpiv.runs.run import Run, open_run
-from lfpiv.weights.operator import Weights, build_weights
+from lfpiv.runs.run import open_run
+from lfpiv.weights.operator import Weights
 
 if TYPE_CHECKING:
-    from lfpiv.calibration.camera import CalibratedCamera, Calibration
+    from lfpiv.calibration.camera import CalibratedCamera
 
 log = logging.getLogger(__name__)
 
@@ -75,72 +74,43 @@ def preview(
     with open_run(experiment, out, device, progress, selected, writes_results=False) as current:
         number = current.numbers[0]
         calibration = rig.with_standing_light(current, rig.load_calibration(current).calibration)
-        coarse = coarsened(current.experiment)
+        rough = coarsened(current.experiment)
         raw: dict[tuple[str, Frame], np.ndarray] = {}
 
         def read(name: str, frame: Frame) -> np.ndarray:
             raw[name, frame] = current.experiment.frame_image(name, frame)
             return raw[name, frame]
 
-        light = pair_light(coarse, calibration.cameras, read_darks(coarse), number, read)
-        volumes, refocused = _reconstruct(current, coarse, calibration, light)
+        light = pair_light(rough, calibration.cameras, read_darks(rough), number, read)
+        try:
+            weights, volumes = coarse.reconstruct(rough, calibration, light, current.progress)
+        except ValueError as error:
+            raise InputError(f"{rough.name_of(number)}: {error}") from error
         cameras = calibration.cameras.values()
         shown = Preview(
-            title=f"{coarse.name}, {coarse.name_of(number)}: preview on voxels of {coarse.grid.voxel_mm:.3g} mm",
-            volumes=volumes,
-            refocused=refocused,
+            title=f"{rough.name}, {rough.name_of(number)}: preview on voxels of {rough.grid.voxel_mm:.3g} mm",
+            volumes={frame.frame.within: one for frame, one in zip(light, volumes, strict=True)},
+            refocused=_refocused(weights, light[0], rough.grid),
             counts=light[0].images,
-            levels=[_level(coarse, frame, camera, raw) for frame in light for camera in cameras],
+            levels=[_level(rough, frame, camera, raw) for frame in light for camera in cameras],
         )
-        picture = current.folder.path / "preview" / f"{coarse.noun}_{number}.png"
+        picture = current.folder.path / "preview" / f"{rough.noun}_{number}.png"
         with writing(picture):
             picture.parent.mkdir(parents=True, exist_ok=True)
         draw(shown, picture)
     return {
         "picture": str(picture),
-        "voxel_mm": coarse.grid.voxel_mm,
+        "voxel_mm": rough.grid.voxel_mm,
         "levels": [level.to_json() for level in shown.levels],
         "warnings": [warning.sentence for frame in light for warning in frame.warnings],
     }
 
 
-def _reconstruct(
-    current: Run, coarse: Experiment, calibration: Calibration, light: Sequence[FrameLight]
-) -> tuple[dict[str, xr.DataArray], dict[str, xr.DataArray]]:
-    """Return the coarse volume of each frame, and the refocused planes of the first one by camera."""
-    layers = guard.layers(coarse, None)
-    grid, form = guard.with_guard(coarse, layers).grid, _form(calibration.cameras)
-    weights = build_weights(calibration, grid, form=form, progress=current.step("coarse weights"))
-    current.progress("coarse volumes", 0.0)
-    work = Reconstructor(experiment=coarse, weights=weights, guard=layers, refinement=1.0)
-    try:
-        volumes = work.volumes(
-            [frame.images for frame in light], [frame.noise for frame in light], [frame.frame for frame in light]
-        )
-    except ValueError as error:
-        raise InputError(f"{coarse.name_of(current.numbers[0])}: {error}") from error
-    current.progress("coarse volumes", 1.0)
-    named = {frame.frame.within: one for frame, one in zip(light, volumes, strict=True)}
-    return named, _refocused(weights, light[0], coarse.grid)
-
-
 def coarsened(experiment: Experiment) -> Experiment:
     """Return an experiment with at most about `MOST_VOXELS` voxels in the same volume, reconstructed in few steps."""
     grid = experiment.grid
-    edge = max(1.0, (grid.size / MOST_VOXELS) ** (1 / 3)) * grid.voxel_mm
-    x, y, z = (n * grid.voxel_mm for n in reversed(grid.shape))
-    cx, cy, cz = grid.centre_mm.tolist()
-    coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(max(x, edge), max(y, edge), max(z, edge)), voxel_mm=edge)
-    # particles are smaller than these voxels: their size, measured for the sieve and the limit, would say nothing
-    measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if getattr(experiment.smart, key) == "auto"}
-    smart = experiment.smart.model_copy(update={"iterations": ITERATIONS, "estimate": "correlation", **measured})
-    return replace(experiment, grid=coarse, smart=smart)
-
-
-def _form(cameras: Mapping[str, CalibratedCamera]) -> str:
-    """Return the form of weights that is built fastest."""
-    square = all(camera.lattice.layout == "square" for camera in cameras.values())
-    return "profiles" if square else "pixels"
+    found = coarse.coarsened(experiment, max(1.0, (grid.size / MOST_VOXELS) ** (1 / 3)) * grid.voxel_mm)
+    return replace(found, smart=found.smart.model_copy(update={"iterations": ITERATIONS}))
 
 
 def _refocused(weights: Weights, light: FrameLight, grid: Grid) -> dict[str, xr.DataArray]:

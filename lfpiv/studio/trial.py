@@ -14,42 +14,32 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import xarray as xr
 from pydantic import BaseModel, ValidationError
 
 import lfpiv
-from lfpiv.calibration.camera import Calibration
 from lfpiv.errors import InputError
 from lfpiv.experiment import problems
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.opening import read_experiment
-from lfpiv.geometry.grid import Grid
 from lfpiv.results import netcdf
 from lfpiv.results.folder import Folder
-from lfpiv.runs import guard
+from lfpiv.runs import coarse
 from lfpiv.runs.frame_light import pair_light, read_darks
 from lfpiv.runs.pair_vectors import measure_vectors
-from lfpiv.runs.pair_volumes import Reconstructor
-from lfpiv.settings.processing import Correlation, Smart
+
+LEAST_VOXELS = 4
+"""Least number of voxels along each axis: the smallest window."""
 
 Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def with_settings(experiment: Experiment, coarser: float, changed: dict[str, dict[str, Any]]) -> Experiment:
-    """Return an experiment on voxels that are some times as long, with some settings of SMART and correlation changed.
-
-    Particles are smaller than coarse voxels. So their size and the cap, where these are to be measured, are left out.
-    """
-    grid = experiment.grid
-    edge = grid.voxel_mm * coarser
-    x, y, z = (max(n * grid.voxel_mm, 4 * edge) for n in grid.shape[::-1])
-    cx, cy, cz = grid.centre_mm.tolist()
-    coarse = Grid.from_extent(centre_mm=(cx, cy, cz), size_mm=(x, y, z), voxel_mm=edge)
-    stated = experiment.smart.model_dump() | changed.get("smart", {})
-    measured = {key: 0.0 for key in ("sieve_voxel", "intensity_cap") if stated[key] == "auto"}
-    smart = checked(Smart, stated | measured | {"refinement": 1.0, "estimate": "correlation"})
-    correlation = checked(Correlation, experiment.correlation.model_dump() | changed.get("correlation", {}))
-    return replace(experiment, grid=coarse, smart=smart, correlation=correlation)
+    """Return an experiment on voxels that are some times as long, with other settings of SMART and correlation."""
+    tables: dict[str, Any] = {
+        name: checked(type(table), table.model_dump() | changed.get(name, {}))
+        for name, table in (("smart", experiment.smart), ("correlation", experiment.correlation))
+    }
+    return coarse.coarsened(replace(experiment, **tables), coarser * experiment.grid.voxel_mm, LEAST_VOXELS)
 
 
 def checked(table: type[Settings], values: dict[str, Any]) -> Settings:
@@ -61,20 +51,6 @@ def checked(table: type[Settings], values: dict[str, Any]) -> Settings:
         raise InputError(f"{'.'.join(map(str, place))}: {text}") from None
 
 
-def vectors_of(experiment: Experiment, calibration: Calibration, pair: int) -> xr.Dataset:
-    """Reconstruct both frames of a pair and correlate them, without the checks and measurements of a run."""
-    layers = guard.layers(experiment, None)
-    square = all(camera.lattice.layout == "square" for camera in calibration.cameras.values())
-    form = "profiles" if square else "pixels"  # which is built fastest
-    weights = lfpiv.build_weights(calibration, guard.with_guard(experiment, layers).grid, form=form)
-    darks = read_darks(experiment)
-    light = pair_light(experiment, calibration.cameras, darks, pair)
-    work = Reconstructor(experiment=experiment, weights=weights, guard=layers, refinement=1.0)
-    images, noise, frames = ([getattr(one, name) for one in light] for name in ("images", "noise", "frame"))
-    first, second = work.volumes(images, noise, frames)
-    return measure_vectors(first, second, experiment)
-
-
 def measure(request: dict[str, Any]) -> dict[str, Any]:
     """Do what a request asks for; return figures of the vectors."""
     experiment = with_settings(read_experiment(request["experiment"]), request["coarser"], request["changed"])
@@ -83,7 +59,9 @@ def measure(request: dict[str, Any]) -> dict[str, Any]:
     calibration = lfpiv.load_calibration(stored) if calibrated else lfpiv.thin_lens(experiment)  # type: ignore[arg-type]
     start = time.perf_counter()
     pair = int(request["pair"])
-    vectors = vectors_of(experiment, calibration, pair)
+    light = pair_light(experiment, calibration.cameras, read_darks(experiment), pair)
+    _, (first, second) = coarse.reconstruct(experiment, calibration, light, lambda *_: None)
+    vectors = measure_vectors(first, second, experiment)
     netcdf.write_vectors(vectors, Folder(Path(request["out"])).vectors(pair), attributes={"pair": pair})
     uncertainty = float(np.nanmedian(vectors["uncertainty"].values)) if "uncertainty" in vectors else float("nan")
     return {

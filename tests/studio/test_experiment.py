@@ -89,6 +89,18 @@ def test_a_setting_out_of_range_is_told_by_a_trial(draft):
         trial.with_settings(read_experiment(draft.path), 2.0, {"smart": {"intensity_cap": 2000.0}})
 
 
+def test_a_trial_measures_a_pair_on_longer_voxels(small_run, tmp_path):
+    from lfpiv.studio import trial
+
+    request = {"experiment": str(small_run.experiment), "results": str(small_run.out), "pair": 0, "out": str(tmp_path)}
+    answer = trial.measure(request | {"coarser": 1.3, "changed": {"correlation": {"windows": [6]}}})
+    vectors = lfpiv.open_results(tmp_path).isel(pair=0)
+    assert answer["calibrated"] and answer["vectors"] == vectors["valid"].size
+    assert vectors["u"].notnull().all() and vectors.attrs["voxel_mm"][0] == pytest.approx(
+        1.3 * lfpiv.open_experiment(small_run.experiment).grid.voxel_mm
+    )
+
+
 def test_cameras_and_solids_are_added_and_removed(draft):
     draft.add_camera()
     draft.add_solid("half_space", {"point_mm": [0.0, -0.2, 0.0], "normal": [0.0, 1.0, 0.0]})
