@@ -73,7 +73,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
         _log_scales(light[0])
     refusals = mistakes_of_pairs(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
-        refusals = _far_delay(experiment, names, shown, weights, list(judged))
+        refusals = _far_delay(experiment, names, as_judged, weights, list(judged))
     if not refusals and not any(one.in_order for one in judged.values()):
         refusals = _opposite_motion(experiment, as_judged, weights, tried)
     if refusals:
@@ -240,8 +240,10 @@ def _far_delay(
     """Return the refusal of all pairs if a camera is late or early by more pairs than are usually tried."""
     fit, far = ImageFit(weights), [late for late in range(-FARTHEST, FARTHEST + 1) if abs(late) > max(NEIGHBOURS)]
     for pair in pairs:
-        others, _ = _shifts(experiment, pair)
-        found = judge(fit, shown, pair, others, [late for late in far if pair + late in experiment.numbers])
+        recorded = [late for late in far if pair + late in experiment.numbers]
+        if not recorded:
+            continue
+        found = judge(fit, shown, pair, _shifts(experiment, pair)[0], recorded)
         if found.mistakes and found.mistakes[0].kind is Kind.LATE:
             return [refusal(experiment, names, found.mistakes)]
     return []

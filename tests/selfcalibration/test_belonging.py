@@ -217,3 +217,18 @@ def test_flows_that_fluctuate_or_oscillate_are_not_reversed(count):
     assert not reversed_pairs({pair: figures_of(ROTATION, 1.0, pair) for pair in range(count)})
     if count > 3:
         assert not reversed_pairs({pair: figures_of((-1) ** pair * ROTATION, 0.1, pair) for pair in range(count)})
+
+
+def test_a_single_pair_of_twice_the_same_frame_that_fits_no_other_camera_is_not_compared(rig, small_run, tmp_path):
+    """Nothing of it moves, so no light is left. What was copied is named where the pair is reconstructed."""
+    file = small_run.images(tmp_path / "data")
+    for camera in ("left", "right"):
+        first, second, *rest = sorted((file.parent / "particles" / camera).iterdir())
+        shown = first.read_bytes() if camera == "left" else rest[0].read_bytes()
+        first.write_bytes(shown)
+        second.write_bytes(shown)
+        for path in rest:
+            path.unlink()
+    file.write_text(file.read_text("utf-8").replace("pairs = 4", "pairs = 1"), "utf-8")
+    found = belonging.check(lfpiv.open_experiment(file), rig[1], [0])
+    assert not found.refusals and "cannot be told from pair 0" in found.sentence
