@@ -38,6 +38,8 @@ LEAST_FOR_NOTHING = 2
 """Least number of pairs without common particles that a refusal of them needs."""
 UNLIKE_SCALES = 8.0
 """Ratio of the cameras' counts from which on the log states it: scattering angles and apertures hardly make more."""
+EXCHANGED = (128.0, 512.0)
+"""Ratios of counts as exchanged bytes of dim images make them: 256, less what differs between the cameras."""
 NEIGHBOURS = (1, -1, 2, -2)
 """Pairs, or instants, by which a camera may be late."""
 FARTHEST = 10
@@ -69,14 +71,14 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     shown = ShownParticles(experiment, weights.cameras, tried)
     as_judged = shown if len(tried) > 1 else replace(shown, pairs=())  # one pair does not tell what stands still
     judged = _judge(as_judged, tried, weights)
-    for light in islice(_light(shown, judged), 1):
-        _log_scales(light[0])
+    scales = [far for light in islice(_light(shown, judged), 1) if (far := _scales_apart(light[0]))]
     refusals = mistakes_of_pairs(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, as_judged, weights, list(judged))
     if not refusals and not any(one.in_order for one in judged.values()):
         refusals = _opposite_motion(experiment, as_judged, weights, tried)
     if refusals:
+        refusals = scales or refusals  # what else is wrong cannot be told from such images
         return _told(
             "; ".join(dict.fromkeys(str(one.figures["found"]) for one in refusals)),
             refusals=tuple(refusals),
@@ -140,16 +142,25 @@ def _dark_warnings(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[
     ]
 
 
-def _log_scales(images: Images) -> None:
-    """Log how far the counts of the cameras differ, if it is much. Up to 1 / `DIMMEST` vectors do not depend on it."""
+def _scales_apart(images: Images) -> Warning | None:
+    """Log how far the counts of the cameras differ, if it is much. Return why vectors depend on it, if they do.
+
+    Up to 1 / `DIMMEST` it is divided out.
+    """
     light = {name: float(np.mean(image, dtype=float)) for name, image in images.items()}
     bright, dim = max(light, key=light.__getitem__), min(light, key=light.__getitem__)
-    if light[dim] > 0 and (ratio := light[bright] / light[dim]) >= UNLIKE_SCALES:
-        text = f"cameras: the images of {bright} have {ratio:.0f} times the counts of {dim}"
-        if ratio * DIMMEST < 1:
-            log.info("%s; the scale of each camera is divided out", text)
-        else:
-            log.warning("%s, more than can be divided out: store the images of both on one scale", text)
+    if light[dim] <= 0 or (ratio := light[bright] / light[dim]) < UNLIKE_SCALES:
+        return None
+    text = f"the images of {bright} have {ratio:.0f} times the counts of {dim}"
+    if ratio * DIMMEST < 1:
+        log.info("cameras: %s; the scale of each camera is divided out", text)
+        return None
+    text += ", more than can be divided out"
+    log.warning("cameras: %s: store the images of both on one scale", text)
+    remedy = "Store the images of both on one scale"
+    if EXCHANGED[0] < ratio < EXCHANGED[1]:
+        remedy = f"Look at the order of the bytes of {bright}: an exchange makes some 256 times the counts"
+    return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy})
 
 
 def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:

@@ -171,6 +171,18 @@ def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_pa
 
 
 @pytest.mark.slow
+def test_scales_that_cannot_be_divided_out_are_named_in_place_of_other_mistakes(rig, small_run, tmp_path):
+    file = small_run.images(tmp_path / "data")
+    for path in (file.parent / "particles" / "left").iterdir():
+        tifffile.imwrite(path, np.ascontiguousarray(tifffile.imread(path)[:, ::-1]))
+    for path in (file.parent / "particles" / "right").iterdir():
+        tifffile.imwrite(path, (tifffile.imread(path) * np.float32(1 / 50)).astype(np.float32))
+    (refusal,) = belonging.check(lfpiv.open_experiment(file), rig[1], [0]).refusals
+    assert "times the counts of right" in refusal.sentence and "on one scale" in refusal.sentence
+    assert "mirrored" not in refusal.sentence
+
+
+@pytest.mark.slow
 def test_a_pair_whose_frames_are_exchanged_in_one_camera_is_refused(small_run, tmp_path, empty_report):
     file = small_run.images(tmp_path / "data")
     left = sorted((file.parent / "particles" / "left").iterdir())
