@@ -250,6 +250,10 @@ class Experiment(Shown):
         images.require_contrast(image, path, label)
         return image
 
+    def frame_white_level(self, name: str, frame: Frame) -> float | None:
+        """Return the value from which on pixels of a camera's image of a frame are saturated, see `white_level`."""
+        return white_level(self.frame_path(name, frame), self.camera(name))
+
     def background_image(self, name: str, frame: str) -> np.ndarray | None:
         """Return the background image of a camera [counts], float32 (rows, columns); None where the file names none."""
         path = self.background_path(name, frame)

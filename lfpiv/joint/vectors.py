@@ -50,7 +50,7 @@ unlike light."""
 EDGE_VOXEL = 1
 """Error of the edge of a region without particles, where it is found and not stated [voxel]."""
 LEAST_PART = 0.25
-"""Least wet part of a window that its uncertainty is divided by: the field beside a wall has one side only."""
+"""Least wet part of a window by which its uncertainty is divided. Beside a wall, particles lie on one side only."""
 FARTHEST_VOXEL = 0.5
 """Displacement that is left above which they contradict in any case [voxel]."""
 FIELD_CORRELATION_VOXEL = 5.9

@@ -21,8 +21,8 @@ from lfpiv.results import netcdf
 FEW_VOLUMES = 6
 """Largest number of volumes with a line each in the chart of residuals. Of more, median and range are drawn."""
 LAST_IS_JOINT = (
-    " The last value is after the joint fit, where one moving volume explains both frames; it is larger than before, "
-    "where each frame has a volume of its own."
+    " The last value is after the joint fit. There one moving volume explains both frames, which usually leaves more "
+    "than a volume of each frame."
 )
 """Sentence on the residuals of image pairs that were fitted jointly."""
 BAND = (5, 95)

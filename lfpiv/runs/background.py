@@ -251,7 +251,7 @@ def _read_series(
             continue
         for frame, image in zip(frames, images, strict=True):
             shift = 2 * (frame.number // apart) if experiment.recording.is_series else None
-            level = white_level(experiment.frame_path(camera.name, frame), experiment.camera(camera.name))
+            level = experiment.frame_white_level(camera.name, frame)
             light, noise, saturated = _without_dark(image, dark, camera, level)
             power = 1.0 if estimate is None else estimate.power(light, frame.laser)
             series[frame.laser].add(light / np.float32(power), noise / power, saturated, shift)

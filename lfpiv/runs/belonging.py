@@ -39,7 +39,7 @@ LEAST_FOR_NOTHING = 2
 UNLIKE_SCALES = 8.0
 """Ratio of the cameras' counts from which on the log states it: scattering angles and apertures hardly make more."""
 EXCHANGED = (128.0, 512.0)
-"""Ratios of counts as exchanged bytes of dim images make them: 256, less what differs between the cameras."""
+"""Ratios of the cameras' counts that exchanged bytes of dim images make: 256 times the ratio that they should have."""
 NEIGHBOURS = (1, -1, 2, -2)
 """Pairs, or instants, by which a camera may be late."""
 FARTHEST = 10
@@ -71,14 +71,15 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     shown = ShownParticles(experiment, weights.cameras, tried)
     as_judged = shown if len(tried) > 1 else replace(shown, pairs=())  # one pair does not tell what stands still
     judged = _judge(as_judged, tried, weights)
-    scales = [far for light in islice(_light(shown, judged), 1) if (far := _scales_apart(light[0]))]
+    light = next(_light(shown, judged), None)
+    scales = None if light is None else _scales_apart(light[0])
     refusals = mistakes_of_pairs(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, as_judged, weights, list(judged))
     if not refusals and not any(one.in_order for one in judged.values()):
         refusals = _opposite_motion(experiment, as_judged, weights, tried)
     if refusals:
-        refusals = scales or refusals  # what else is wrong cannot be told from such images
+        refusals = refusals if scales is None else [scales]  # such images do not tell what else is wrong
         return _told(
             "; ".join(dict.fromkeys(str(one.figures["found"]) for one in refusals)),
             refusals=tuple(refusals),
@@ -145,7 +146,7 @@ def _dark_warnings(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[
 def _scales_apart(images: Images) -> Warning | None:
     """Log how far the counts of the cameras differ, if it is much. Return why vectors depend on it, if they do.
 
-    Up to 1 / `DIMMEST` it is divided out.
+    A ratio of up to 1 / `DIMMEST` is divided out.
     """
     light = {name: float(np.mean(image, dtype=float)) for name, image in images.items()}
     bright, dim = max(light, key=light.__getitem__), min(light, key=light.__getitem__)

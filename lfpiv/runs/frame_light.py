@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import white_level
 from lfpiv.experiment.recording import Frame
 from lfpiv.lightfield import image_checks
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
@@ -80,7 +79,7 @@ def frame_light(
     clipped = {}
     for name, camera in cameras.items():
         raw = experiment.frame_image(name, frame) if read is None else read(name, frame)
-        top = white_level(experiment.frame_path(name, frame), experiment.camera(name))
+        top = experiment.frame_white_level(name, frame)
         images[name], noise[name] = without_background(camera, raw, darks[name], frame)
         light = images[name]
         clipped[name] = saturated_pixels(raw, top)

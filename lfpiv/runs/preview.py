@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.errors import InputError
-from lfpiv.experiment.experiment import Experiment, white_level
+from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
@@ -146,8 +146,6 @@ def _level(
         noise=noise,
         peak=peak if np.isfinite(peak) else 0.0,
         lit=float((brightest > PEAK_SIGMA * noise).mean()),
-        saturated=saturated_share(
-            recorded, white_level(experiment.frame_path(name, light.frame), experiment.camera(name))
-        ),
+        saturated=saturated_share(recorded, experiment.frame_white_level(name, light.frame)),
         structure=light.structure[name],
     )

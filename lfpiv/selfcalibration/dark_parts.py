@@ -27,8 +27,8 @@ CELLS = 12
 DARK = 0.25
 """Largest root of a dark region's light, over the root of the expected light."""
 LEAST_SHARE = 0.1
-"""Least share of a sensor's expected light in a dark region: what other cameras smear beyond an edge of the seeding is
-dim, and its root would look large."""
+"""Least share of a sensor's expected light in a dark region. Other cameras smear dim light beyond an edge of the
+seeding, and its root would seem much."""
 LARGEST_SHARE = 0.75
 """Largest share: the rest is what the region is compared with."""
 BLOCK = 3
