@@ -33,7 +33,7 @@ from lfpiv.warn import Warning
 from lfpiv_kernels.rays import mapping
 from lfpiv_kernels.weights.microimages import Microimages
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Version of the calibration file's form."""
 
 HEAD = ("camera", "pixels (rows, columns)", "microlenses", "mapping", "dots found", "error [pitch]", "warnings")

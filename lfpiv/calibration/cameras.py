@@ -1,7 +1,7 @@
 """Calibrate the cameras of an experiment: from white and board images to the ray mapping of each camera.
 
 Section 3.1 of the paper: the white image gives the microlens array, the board images give labelled rays of dots, and a
-thin lens plus a network is fitted to the labels (Eqs. 6-7). The mean error on held-out dots is sigma_nor (Eq. 8).
+thin lens plus a network is fitted to the labels (Eqs. 6-7). Its estimated error is sigma_nor.
 Errors of the board that the labels of all cameras show are corrected before.
 `thin_lens` gives the mapping by direct ray tracing (DRT) instead, from the stated optics and angles only (Eqs. 1-3).
 """
@@ -21,12 +21,11 @@ from lfpiv.calibration import checks, contradictions, scales
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.errors import KINDS, BoardErrors
-from lfpiv.calibration.board.pupil_zones import mean_size
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
-from lfpiv.calibration.committee import train_several
+from lfpiv.calibration.committee import Rays, distance_of_halves, smooth_departure, train_several
 from lfpiv.calibration.liquid import median_distance
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
@@ -39,7 +38,7 @@ from lfpiv.calibration.measured_camera import (
     measure_or_load,
 )
 from lfpiv.calibration.quality import CalibrationQuality
-from lfpiv.calibration.thin_lens_model import ThinLensModel, thin_lens_model
+from lfpiv.calibration.thin_lens_model import ThinLensModel, fit_thin_lens, thin_lens_model
 from lfpiv.calibration.training import Training, TrainingSettings, train
 from lfpiv.calibration.virtual_samples import sampler_between_dots
 from lfpiv.errors import InputError
@@ -163,10 +162,10 @@ class _Mapping:
     """The network and its errors."""
     agreeing: np.ndarray
     """Labels used, shape (n,), bool."""
-    scatter: float
-    """Error that the chance of the training makes [microlens pitch]."""
+    error: float
+    """Error that the labels' noise and the training make [microlens pitch]."""
     sigma_nor_stated: float
-    """Mean error on the held-out dots at their stated places [microlens pitch]."""
+    """Mean distance to the held-out dots at their stated places, Eq. 8 [microlens pitch]."""
 
 
 def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> BoardErrors:
@@ -261,35 +260,45 @@ def _fit_mapping(
     points, pupil, std = dots.points_mm[agreeing], dots.pupil_mm[agreeing], std[agreeing]
     target = (dots.array_mm if baseline is None else residual)[agreeing]
 
-    def trained(seed: int) -> Training:
+    rules = TrainingSettings(hidden=tuple(settings.hidden), epochs=settings.epochs, shrink=baseline is not None)
+
+    def trained(seed: int, part: np.ndarray | slice = slice(None), target: np.ndarray = target) -> Training:
+        where, labels, errors = (points[part], pupil[part]), target[part], std[part]
         return train(
-            np.hstack([points, pupil]),
-            target,
-            TrainingSettings(
-                hidden=tuple(settings.hidden),
-                epochs=settings.epochs,
-                shrink=baseline is not None,
-                seed=seed,
-            ),
-            groups=dots.dot[agreeing],
-            std=std,
-            virtual_samples=sampler_between_dots(points, pupil, target, std, pitch_mm=pitch_mm, seed=seed),
+            np.hstack(where),
+            labels,
+            replace(rules, seed=seed),
+            groups=dots.dot[agreeing][part],
+            std=errors,
+            virtual_samples=sampler_between_dots(*where, labels, errors, pitch_mm=pitch_mm, seed=seed),
             unit=pitch_mm,
         )
 
-    region_mm = np.stack([points.min(0), points.max(0)])
+    def of_part(part: np.ndarray) -> Rays:
+        if baseline is None:
+            network = trained(settings.seed, part).network
+            return lambda *rays: network(np.hstack(rays))
+        array = dots.array_mm[agreeing]
+        own = fit_thin_lens(points[part], pupil[part], array[part], setup.optics, std=std[part])
+        correction = trained(settings.seed, part, array - own(points, pupil)).network
+        return lambda *rays: own(*rays) + correction(np.hstack(rays))
+
+    region_mm, radius = np.stack([points.min(0), points.max(0)]), setup.optics.pupil_radius_mm
     with input_errors(place):
-        chosen = train_several(trained, region_mm, setup.optics.pupil_radius_mm, seed=settings.seed, unit=pitch_mm)
-    training = chosen.training
+        chosen = train_several(trained, region_mm, radius, seed=settings.seed, unit=pitch_mm)
+        halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed) / pitch_mm
+    training, inputs = chosen.training, np.hstack([points, pupil])
+    chance = max(chosen.scatter, training.sigma_nor if math.isnan(halves) else halves)
+    unfollowed = smooth_departure(inputs, target - training.network(inputs), dots.dot[agreeing]) / pitch_mm
     held_out = training.split.test
-    inputs = stated_mm[agreeing][held_out], pupil[held_out]
-    mapped = training.network(np.hstack(inputs)) + (0.0 if baseline is None else baseline(*inputs))
+    held = stated_mm[agreeing][held_out], pupil[held_out]
+    mapped = training.network(np.hstack(held)) + (0.0 if baseline is None else baseline(*held))
     stated = np.linalg.norm(mapped - dots.array_mm[agreeing][held_out], axis=1) / pitch_mm
     return _Mapping(
         baseline=baseline,
         training=training,
         agreeing=agreeing,
-        scatter=chosen.scatter,
+        error=math.hypot(chance, unfollowed),
         sigma_nor_stated=float(stated.mean()),
     )
 
@@ -306,9 +315,7 @@ def _quality(
         **vars(sensor.quality),
         turn_from_nominal_deg=nominal.turn_deg,
         magnification=nominal.magnification,
-        sigma_nor_test=math.hypot(
-            max(training.sigma_nor, mapping.scatter), mean_size(dots.left_over_mm) / sensor.lattice.pitch_mm
-        ),
+        sigma_nor_test=math.hypot(mapping.error, dots.shared_error_mm / sensor.lattice.pitch_mm),
         sigma_nor_stated=mapping.sigma_nor_stated,
         dots_found=int(dots.found.sum()),
         dots_expected=int(dots.expected.sum()),

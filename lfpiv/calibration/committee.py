@@ -1,13 +1,17 @@
-"""Choose one of several networks that differ by the seed of their training only.
+"""Choose one of several networks that differ by the seed of their training only, and estimate the error of the mapping.
 
 A network whose first weights or split were unlucky can leave the true mapping between the dots or at the border of the
 board, where no held-out dot shows it. Such errors differ from network to network. So the network nearest to the others
-is taken, and its distance to them is an estimate of its error [1]_.
+is taken, and its distance to them is an estimate of its error [1]_. What the noise of the labels makes, all of them
+share in part. So two mappings are fitted as well, each to half of the dots: half of their distance is the error of a
+mapping that is fitted to all dots [2]_.
 
 References
 ----------
 .. [1] L. K. Hansen, P. Salamon, "Neural network ensembles", IEEE Trans. Pattern Anal. Mach. Intell. 12 (1990) 993-1001,
    doi:10.1109/34.58871.
+.. [2] P. C. Mahalanobis, "On large-scale sample surveys", Phil. Trans. R. Soc. B 231 (1944) 329-451 (interpenetrating
+   samples), doi:10.1098/rstb.1944.0002.
 """
 
 from __future__ import annotations
@@ -17,7 +21,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
+from lfpiv.calibration.board.pupil_zones import INNER
 from lfpiv.calibration.training import Training
 from lfpiv.geometry.optics import random_on_pupil
 
@@ -28,6 +34,13 @@ NETWORKS, MOST_NETWORKS = 3, 7
 one that is wrong shows among three. More are trained while they scatter by more than the held-out dots show."""
 RAYS = 2000
 """Rays on which networks are compared."""
+FEWEST_DOTS = 40
+"""Least number of dots that are halved."""
+CHANCE = 1e-3
+"""Probability that labels about a mapping that follows them show a smooth departure by chance."""
+
+Rays = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Map points (n, 3) and pupil points (n, 2) to the array (n, 2) [mm]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,3 +116,65 @@ def nearest_to_others(
     distances = np.median(np.sort(between, axis=1)[:, 1:], axis=1)  # less the distance to itself, which is 0
     best = int(distances.argmin())
     return Chosen(training=trainings[best], scatter=float(distances[best] / np.sqrt(2)))
+
+
+def distance_of_halves(
+    fit: Callable[[np.ndarray], Rays], dot: np.ndarray, region_mm: np.ndarray, pupil_radius_mm: float, seed: int
+) -> float:
+    """Return the mean error of a mapping that the noise of its labels makes, from mappings of half of the dots each.
+
+    A half has twice the variance of the whole, the difference of two halves four times. Rays pass within `INNER` of the
+    pupil's radius.
+
+    Parameters
+    ----------
+    fit : callable
+        Fits a mapping to some of the labels, an array of bool.
+    dot : ndarray, shape (n,)
+        Number of each label's dot.
+    region_mm, pupil_radius_mm, seed
+        As `nearest_to_others` takes them.
+
+    Returns
+    -------
+    float
+        The error in the unit of the mappings' outputs; nan with less than `FEWEST_DOTS` dots.
+    """
+    rng, (low, high), dots = np.random.default_rng(seed), region_mm, np.unique(dot)
+    if len(dots) < FEWEST_DOTS:
+        return np.nan
+    half = np.isin(dot, rng.permutation(dots)[: len(dots) // 2])
+    rays = rng.uniform(low, high, (RAYS, 3)), random_on_pupil(INNER * pupil_radius_mm, RAYS, rng)
+    apart = fit(half)(*rays) - fit(~half)(*rays)
+    return float(np.linalg.norm(apart, axis=1).mean() / 2)
+
+
+def smooth_departure(inputs: np.ndarray, departure: np.ndarray, dot: np.ndarray) -> float:
+    """Return what labels depart from a mapping on average by a quadratic function of the rays.
+
+    Two halves of the dots do not show where no mapping follows the labels, as after too few epochs.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (n, 5)
+        Rays (x, y, z, u, v) [mm].
+    departure : ndarray, shape (n, 2)
+        Labels minus the mapping.
+    dot : ndarray, shape (n,)
+        Number of each label's dot. The labels of a dot count as a single one.
+
+    Returns
+    -------
+    float
+        The mean length of the function, in the unit of the departures; 0 where chance explains it.
+    """
+    scaled = (inputs - inputs.mean(0)) / np.maximum(inputs.std(0), 1e-12)
+    first, second = np.triu_indices(scaled.shape[1])
+    terms = np.hstack([np.ones((len(scaled), 1)), scaled, scaled[:, first] * scaled[:, second]])
+    smooth = terms @ np.linalg.lstsq(terms, departure, rcond=None)[0]
+    count, free = terms.shape[1], len(np.unique(dot)) - terms.shape[1]
+    if free < 1:
+        return 0.0
+    ratio = (smooth**2).sum() / count / max(((departure - smooth) ** 2).sum() / free, 1e-300)
+    shown = stats.f.sf(ratio, 2 * count, 2 * free) < CHANCE
+    return float(np.linalg.norm(smooth, axis=1).mean()) if shown else 0.0

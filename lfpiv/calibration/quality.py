@@ -52,11 +52,11 @@ class CalibrationQuality(LensArrayQuality):
     magnification: float
     """Magnification at the middle of the board."""
     sigma_nor_test: float
-    """Mean error of the mapping on held-out dots, Eq. 8, at least the scatter of networks trained alike [microlens
-    pitch]. Errors of the board are corrected."""
+    """Estimated mean error of the mapping within 0.9 of the pupil's radius [microlens pitch]: of the labels' noise, of
+    the training, and of what all labels share. Errors of the board are corrected."""
     sigma_nor_stated: float = math.nan
-    """The same with the dots where they are stated to be: errors of the mapping and of the board together. Equal to
-    `sigma_nor_test` where nothing is corrected."""
+    """Mean distance of the mapping to held-out dots where they are stated to be, Eq. 8 [microlens pitch]: errors of the
+    dots' labels, of the mapping and of the board together."""
     dots_found: int
     """Dots measured in all planes."""
     dots_expected: int

@@ -32,8 +32,8 @@ BINS = 50
 """Number of bins of a histogram of errors."""
 
 _ROWS = (
-    ("error of the mapping, σ_nor (Eq. 8) [pitch]", "sigma_nor_test", 4),
-    ("the same with the board as stated [pitch]", "sigma_nor_stated", 4),
+    ("estimated error of the mapping, σ_nor [pitch]", "sigma_nor_test", 4),
+    ("distance to held-out dots as stated (Eq. 8) [pitch]", "sigma_nor_stated", 4),
     ("dots measured", "dots_found", 0),
     ("dots in the field", "dots_expected", 0),
     ("labels", "labels", 0),
@@ -169,7 +169,7 @@ def _mapping_figure(experiment: Experiment, camera: CalibratedCamera, found: Dot
     held_out = camera.test_errors
     if held_out is not None and len(held_out):
         shown.append(error_histogram(np.asarray(held_out)))
-        rows = [["mean, σ_nor", number(float(held_out.mean()), 4)]]
+        rows = [["mean (Eq. 8)", number(float(held_out.mean()), 4)]]
         rows += [[f"{share} % below", number(float(np.percentile(held_out, share)), 4)] for share in PERCENTILES]
         rows += [["largest", number(float(held_out.max()), 4)], ["labels", f"{len(held_out):,}"]]
         table = markup.table(

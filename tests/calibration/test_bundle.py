@@ -74,6 +74,7 @@ def labels(angle, optics, points, rng, board=BOARD, wrong=0):
         measured_dot=np.arange(count), chief_mm=np.zeros((count, 2)), slope=np.zeros((count, 2, 2)),
         reduced_chi2=np.ones(count), response_share=1.0, diameter_mm=0.1, blur_px=0.4, points_mm=board.of_dots_mm(dot),
         found=planes, expected=planes, rejected=0 * planes, left_over_mm=np.zeros((4, 33, 2)),
+        shared_error_mm=0.0,
     )  # fmt: skip
     lens = fit_thin_lens(dots.points_mm, pupil, array, scene_camera.optics, std=dots.std_mm)
     return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=radius, pitch_mm=0.1)

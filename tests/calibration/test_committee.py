@@ -5,7 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lfpiv.calibration.committee import MOST_NETWORKS, NETWORKS, nearest_to_others, train_several
+from lfpiv.calibration.committee import (
+    MOST_NETWORKS,
+    NETWORKS,
+    distance_of_halves,
+    nearest_to_others,
+    smooth_departure,
+    train_several,
+)
 from lfpiv.calibration.training import TrainingSettings, train
 from lfpiv.geometry.optics import random_on_pupil
 
@@ -71,3 +78,42 @@ def test_the_scatter_is_stated_in_the_unit_of_the_errors(trainings):
     chosen = train_several(lambda _: next(several), REGION_MM, PUPIL_MM, seed=0, unit=LENGTH_MM)
     alone = nearest_to_others(trainings, REGION_MM, PUPIL_MM, seed=0)
     assert chosen.scatter == pytest.approx(alone.scatter / LENGTH_MM)
+
+
+DOTS, LABELS, NOISE_MM = 400, 12, 0.01
+
+
+def noisy_labels(random):
+    """Return dots, rays and labels; the noise is shared by the labels of a dot."""
+    dot = np.repeat(np.arange(DOTS), LABELS)
+    points = random.uniform(*REGION_MM, (DOTS, 3))[dot]
+    rays = np.hstack([points, random_on_pupil(PUPIL_MM, len(dot), random)])
+    return dot, rays, places(rays) + NOISE_MM * random.normal(size=(DOTS, 2))[dot]
+
+
+def test_half_the_distance_of_two_halves_is_the_error_that_noise_makes():
+    """A linear fit of ten terms has the error NOISE sqrt(10 / dots) per coordinate."""
+    found = []
+    for seed in range(20):
+        dot, rays, labels = noisy_labels(np.random.default_rng(seed))
+
+        def terms(points, pupil):
+            x, y, z = points.T
+            return np.column_stack([np.ones(len(x)), points, points**2, x * y, x * z, y * z])
+
+        def fit(part, rays=rays, labels=labels, terms=terms):
+            smooth = np.linalg.lstsq(terms(rays[part, :3], 0), (labels - places(rays))[part], rcond=None)[0]
+            return lambda points, pupil: terms(points, pupil) @ smooth
+
+        found.append(distance_of_halves(fit, dot, REGION_MM, PUPIL_MM, seed))
+    expected = NOISE_MM * np.sqrt(10 / DOTS) * np.sqrt(np.pi / 2)
+    assert np.mean(found) == pytest.approx(expected, rel=0.15)  # of twenty draws, each with ten unknowns
+    assert np.isnan(distance_of_halves(fit, dot % 30, REGION_MM, PUPIL_MM, 0))
+
+
+def test_a_mapping_that_does_not_follow_its_labels_departs_smoothly():
+    dot, rays, labels = noisy_labels(np.random.default_rng(2))
+    assert smooth_departure(rays, labels - places(rays), dot) == 0
+    bent = 0.02 * (rays[:, :1] / 2) ** 2 * [1.0, 0.0]
+    assert smooth_departure(rays, labels + bent - places(rays), dot) == pytest.approx(0.02 / 3, rel=0.3)
+    assert smooth_departure(rays[:20], bent[:20], dot[:20]) == 0  # too few to tell

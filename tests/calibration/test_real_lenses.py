@@ -83,7 +83,18 @@ def test_displaced_rays_are_found_in_their_zone_and_none_in_noise():
     assert np.abs(found - displaced).max() < STANDARD_ERRORS / np.sqrt(0.5e5 * 12)
     size, middle = pupil_zones.worst(found)
     assert abs(size - 0.005) < 0.001 and middle == pytest.approx(tuple(zone_middles()[20]))
-    assert pupil_zones.mean_size(found) > zone_shares()[20] * 0.004
+    inner = pupil_zones.shared_error(fits_of(displaced, 80, random), found, PITCH)
+    assert inner > zone_shares()[20] * 0.004
+
+
+def test_rays_that_are_displaced_too_little_to_be_told_are_in_the_shared_error():
+    """All zones are displaced by four standard errors, and by less than what is told."""
+    random, none = np.random.default_rng(3), np.zeros((pupil_zones.PARTS, ZONES, 2))
+    chief = random.uniform(-1, 1, (2000, 2))
+    displaced = fits_of(np.tile([0.0004, 0.0], (ZONES, 1)), 2000, random)
+    assert not pupil_zones.left_over(displaced, chief, PITCH).any()
+    assert pupil_zones.shared_error(displaced, none, PITCH) == pytest.approx(0.0004, rel=0.1)
+    assert pupil_zones.shared_error(fits_of(np.zeros((ZONES, 2)), 2000, random), none, PITCH) < 0.0001
 
 
 F_NUMBER = {"heliar": 4.5}

@@ -168,6 +168,9 @@ class Labels:
     left_over_mm: np.ndarray
     """Displacement of rays that their pixels show beside the labels, by part of the field and zone of the pupil [mm],
     shape (PARTS, ZONES, 2); zero where they show none, and for the Gaussian estimator."""
+    shared_error_mm: float
+    """Error that the labels of all dots share, so that no comparison of labels shows it, mean within 0.9 of the pupil's
+    radius [mm]: what the form of their rays lacks, and the doubt of their blur. 0 for the Gaussian estimator."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

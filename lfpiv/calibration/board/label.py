@@ -20,7 +20,7 @@ from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, e
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard, Labels, expect_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
-from lfpiv.calibration.board.pupil_zones import left_over
+from lfpiv.calibration.board.pupil_zones import left_over, shared_error
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.lightfield.decoder import NORMAL_MAD, LightFieldDecoder
@@ -255,7 +255,9 @@ def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegr
         pupil.append(points)
         array.append(model.rays_mm(terms, fit.coefficients))
         std.append(np.sqrt(variance * max(fit.reduced_chi2, 1)))
-    numbers, fits = np.array(list(measured), int), measured.values()
+    numbers, fits = np.array(list(measured), int), list(measured.values())
+    chief = np.array([fit.coefficients[0] for fit in fits]).reshape(-1, 2)
+    beside = left_over(fits, chief, pitch)
     return Labels(
         pupil_mm=np.concatenate(pupil),
         array_mm=np.concatenate(array),
@@ -263,11 +265,12 @@ def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegr
         dot=np.repeat(numbers, np.array([len(part) for part in std[1:]], int)),
         rejected_dot=rejected,
         measured_dot=numbers,
-        chief_mm=np.array([fit.coefficients[0] for fit in fits]).reshape(-1, 2),
+        chief_mm=chief,
         slope=np.array([slope_of(fit.coefficients, radius) for fit in fits]).reshape(-1, 2, 2),
         reduced_chi2=np.array([fit.reduced_chi2 for fit in fits]),
         response_share=response_share,
         diameter_mm=model.shared.diameter_mm,
         blur_px=model.shared.blur_px,
-        left_over_mm=left_over(list(fits), np.array([fit.coefficients[0] for fit in fits]).reshape(-1, 2), pitch),
+        left_over_mm=beside,
+        shared_error_mm=float(np.hypot(shared_error(fits, beside, pitch), model.shared.doubt_mm)),
     )

@@ -60,6 +60,7 @@ def label_by_gaussian(signals: Signals, decoder: LightFieldDecoder, board: DotBo
         diameter_mm=board.diameter_mm,
         blur_px=np.nan,
         left_over_mm=np.zeros((PARTS, ZONES, 2)),
+        shared_error_mm=0.0,
     )
 
 

@@ -17,6 +17,8 @@ from lfpiv.calibration.board.dot_model import ZONES, zone_middles, zone_shares
 
 PARTS = 4
 """Parts of the field: quadrants about the middle of the measured dots."""
+INNER = 0.9
+"""Part of the pupil's radius within which the error of a mapping is stated. Beyond it lies what the edge cuts off."""
 
 _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
@@ -45,17 +47,15 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
     found = np.zeros((PARTS, ZONES, 2))
     if len(fits) < _FEWEST:
         return found
-    pull, information = (
-        np.stack([getattr(fit, name) for fit in fits]).astype(float) for name in ("zone_pull", "zone_information")
-    )
+    pull, information = _equations(fits)
     right, up = (chief_mm > np.median(chief_mm, axis=0)).T
     parts = [np.flatnonzero(right + 2 * up == part) for part in range(PARTS)]
     clear = False
     for part, here in enumerate([*parts, np.arange(len(fits))]):  # the last one is the whole field, judged as well
         if len(here) < _FEWEST:
             continue
-        mean, error = _displacement(pull[here], information[here], pitch_mm)
-        size, limit = (np.linalg.norm(one, axis=1) for one in (mean, error))
+        mean, scatter, noise = _displacement(pull[here], information[here], pitch_mm)
+        size, limit = (np.linalg.norm(one, axis=1) for one in (mean, np.maximum(scatter, noise)))
         sure = float(np.sqrt(np.mean((size / limit) ** 2))) > _CLEAR
         clear |= sure and bool(size.max() > _LEAST_PITCHES * pitch_mm)
         if part < PARTS:
@@ -63,22 +63,47 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
     return found if clear else np.zeros_like(found)
 
 
-def _displacement(pull: np.ndarray, information: np.ndarray, pitch_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement that dots have in common, and its standard error, shape (ZONES, 2) [mm].
+def shared_error(fits: Sequence[DotFit], left_over_mm: np.ndarray, pitch_mm: float) -> float:
+    """Return the mean displacement of rays beside the ray models of all dots [mm], within `INNER` of the pupil.
 
-    The error is the scatter of the dots, which includes errors of their model, and at least what their pixels' noise
+    Unlike `left_over` it is a best estimate, not a proof: the displacement of each zone over the whole field, less what
+    the scatter of the dots makes of it. Where `left_over` is sure, its displacements count, by part of the field.
+    """
+    inner = np.linalg.norm(zone_middles(), axis=1) < INNER
+    shares = zone_shares()[inner] / zone_shares()[inner].sum()
+    if left_over_mm.any():
+        return float((np.linalg.norm(left_over_mm[:, inner], axis=-1) @ shares).mean())
+    if len(fits) < _FEWEST:
+        return 0.0
+    mean, scatter, _ = _displacement(*_equations(fits), pitch_mm)
+    square = (mean**2).sum(1) - (scatter**2).sum(1)
+    return float(np.sqrt(np.maximum(square, 0))[inner] @ shares)
+
+
+def _equations(fits: Sequence[DotFit]) -> tuple[np.ndarray, np.ndarray]:
+    """Return pull and information of the zones of each dot."""
+    pull, information = (
+        np.stack([getattr(fit, name) for fit in fits]).astype(float) for name in ("zone_pull", "zone_information")
+    )
+    return pull, information
+
+
+def _displacement(
+    pull: np.ndarray, information: np.ndarray, pitch_mm: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the displacement that dots have in common, and two standard errors of it, shape (ZONES, 2) [mm].
+
+    The first is the scatter of the dots, which includes errors of their model. The second is what their pixels' noise
     makes of it: a zone that few dots light scatters too little.
     """
     inverse = np.linalg.inv(information.sum(0) + np.eye(2 * ZONES) / (_PRIOR_PITCHES * pitch_mm) ** 2)
     mean = inverse @ pull.sum(0)
     scatter = (((pull - information @ mean) @ inverse) ** 2).sum(0) * len(pull) / (len(pull) - 1)
-    error = np.sqrt(np.maximum(scatter, np.diag(inverse)))
-    return mean.reshape(2, ZONES).T, error.reshape(2, ZONES).T
-
-
-def mean_size(displacement_mm: np.ndarray) -> float:
-    """Return the mean displacement over the pupil and the parts of the field [mm] of `left_over`'s result."""
-    return float((np.linalg.norm(displacement_mm, axis=-1) @ zone_shares()).mean())
+    return (
+        mean.reshape(2, ZONES).T,
+        np.sqrt(scatter).reshape(2, ZONES).T,
+        np.sqrt(np.diag(inverse)).reshape(2, ZONES).T,
+    )
 
 
 def worst(displacement_mm: np.ndarray) -> tuple[float, tuple[float, float]]:
