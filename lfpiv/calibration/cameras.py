@@ -173,7 +173,7 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
     board = DotBoard.from_settings(experiment.board)
     cameras = [
         CameraLabels(
-            dots=measured[setup.name].dots,
+            dots=_without_surface(measured[setup.name]),
             lens=measured[setup.name].lens,
             pupil_radius_mm=setup.optics.pupil_radius_mm,
             pitch_mm=measured[setup.name].sensor.lattice.pitch_mm,
@@ -187,6 +187,18 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
         scales.check_scales(experiment, cameras)
         checks.check_board(errors, board, pitch, experiment.path)
     return replace(errors, warnings=tuple(warnings))
+
+
+def _without_surface(measured: Measured) -> BoardDots:
+    """Return labels as the thin lens in air would have them, less what the surface of a liquid bends.
+
+    Otherwise few planes would be tilted by what the surface does.
+    """
+    dots, lens, surface = measured.dots, measured.lens, measured.surface
+    if surface is None:
+        return dots
+    bent = surface(dots.points_mm, dots.pupil_mm) - lens(dots.points_mm, dots.pupil_mm)
+    return replace(dots, array_mm=dots.array_mm - bent)
 
 
 def _log_board(errors: BoardErrors) -> None:

@@ -167,6 +167,16 @@ def test_a_camera_that_looks_obliquely_into_water_is_calibrated(in_water):
 
 
 @pytest.mark.slow
+def test_three_planes_in_water_are_not_taken_for_tilted(in_water):
+    """What the surface bends looks like tilts of 4.8 degrees where so few planes are compared with a thin lens in air."""
+    path, text = in_water / "three.toml", (in_water / "experiment.toml").read_text("utf-8")
+    path.write_text(text.replace("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, -0.4, 0.0]"), "utf-8")
+    calibration = lfpiv.calibrate(path)
+    assert calibration.board.corrected == ()
+    assert calibration.cameras["only"].report["dots_found"] == 3 * 25
+
+
+@pytest.mark.slow
 def test_a_camera_that_looks_into_oil_is_calibrated(tmp_path, device):
     window = """
 [camera.window]
