@@ -252,7 +252,7 @@ def test_the_tutorial_quotes_the_demonstration(quoted):
         {"demo": good["demo"] | {"mean_error_voxel": 2 * said["error"][0]}},
         {"demo": good["demo"] | {"mean_error_voxel": float("nan")}},
         {"valid_fraction": 0.9},
-        {"calibration": good["calibration"] | {"left": {"dots_found": 244, "sigma_nor_test": 0.0015}}},
+        {"calibration": good["calibration"] | {"left": {"dots_found": 244, "sigma_nor_test": 0.0004}}},
         {"calibration": good["calibration"] | {"left": {"dots_found": 245, "sigma_nor_test": 0.005}}},
     ):
         assert len(quoted.differences(text, scene, good | changed)) == 1, changed

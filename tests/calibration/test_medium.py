@@ -168,7 +168,7 @@ def test_a_camera_that_looks_obliquely_into_water_is_calibrated(in_water):
 
 @pytest.mark.slow
 def test_three_planes_in_water_are_not_taken_for_tilted(in_water):
-    """What the surface bends looks like tilts of 4.8 degrees where so few planes are compared with a thin lens in air."""
+    """What the surface bends looks like tilts of 4.8 degrees where few planes are compared with a thin lens in air."""
     path, text = in_water / "three.toml", (in_water / "experiment.toml").read_text("utf-8")
     path.write_text(text.replace("[-0.8, -0.4, 0.0, 0.4, 0.8]", "[-0.8, -0.4, 0.0]"), "utf-8")
     calibration = lfpiv.calibrate(path)
