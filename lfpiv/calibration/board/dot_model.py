@@ -31,7 +31,7 @@ from scipy.spatial import Voronoi
 
 from lfpiv.geometry.optics import NEIGHBOURS, LensLattice, Optics, float_pair, spread_over_pupil
 
-BEND_ORDERS = (3, 5, 7)
+BEND_ORDERS = (3, 5)
 """Orders of a bend that are tried in turn: uneven, as the aberrations of a centred lens in the middle of its field."""
 
 _POWERS = [(order - j, j) for order in range(BEND_ORDERS[-1] + 1) for j in range(order + 1)]  # of (u, v)
@@ -67,8 +67,6 @@ class SharedParameters:
     """Blur of sensor and microlenses, standard deviation [pixel]."""
     bend_mm: np.ndarray
     """Coefficients b of the ray model, of third order and higher [mm], shape (`bends`, 2)."""
-    doubt_mm: float = 0.0
-    """Error of the rays, since another blur explains the dots as well [mm]."""
 
     @property
     def order(self) -> int:

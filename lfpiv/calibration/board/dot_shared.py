@@ -26,7 +26,6 @@ from lfpiv.calibration.board.dot_model import (
     ray_terms,
 )
 from lfpiv.calibration.board.dots import ExpectedDot
-from lfpiv.calibration.board.pupil_zones import INNER
 from lfpiv.geometry.optics import spread_over_pupil
 from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.warn import Code, Warning, warn
@@ -120,26 +119,21 @@ def _higher(
 ) -> tuple[SharedParameters, Sequence[DotFit | None]] | None:
     """Fit a bend of a higher order to some dots; None unless they show it beyond chance and fit better with it.
 
-    Diameter and blur stay, because rays that are still bent within a pixel look like blur. But the blur of the lower
-    order may stand for what it lacks. So the stated diameter with half of it is tried as well. The better fit counts,
-    and the distance of the two is a doubt of the rays.
+    Diameter and blur stay, because rays that are still bent within a pixel look like blur. Where the dots show the
+    order but fit no better, the blur of the lower order may stand for what it lacks. Then the stated diameter without
+    blur is tried.
     """
     pitch, typical = pixels.decoder.optics.microlens_pitch_mm, _typical(found)[1]
     known = np.tile(np.arange(bends(order)) < len(lower.bend_mm), 2)
-    tried = []
-    for start in (lower, replace(lower, diameter_mm=stated_diameter_mm, blur_px=lower.blur_px / 2)):
+    for start in (lower, replace(lower, diameter_mm=stated_diameter_mm, blur_px=0.0)):
         shared = start.of_order(order)
         fits = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, found)
         bend, chance = _common_bend(fits, shared, pitch, known)
         if not chance < _CHANCE:
-            break
+            return None
         if best := _stepped(pixels, sample, shared, bend, fits, margin_mm, _WORTH * typical):
-            tried.append(best)
-    if not tried:
-        return None
-    shared, found = min(tried, key=lambda one: _typical(one[1])[1])
-    doubt = _apart(tried[0][0].bend_mm - tried[-1][0].bend_mm) / np.sqrt(2)  # both have errors
-    return replace(shared, doubt_mm=doubt or lower.doubt_mm), found
+            return best
+    return None
 
 
 def _stepped(
@@ -235,17 +229,6 @@ def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[Do
         fit and replace(fit, coefficients=fit.coefficients + (fit.following[:, 2:] @ change).reshape(2, TERMS).T)
         for fit in fits
     ]
-
-
-def _apart(bend: np.ndarray) -> float:
-    """Return the mean displacement of rays by a bend within `INNER` of the pupil, less what the dots' own terms follow.
-
-    In the unit of the bend.
-    """
-    terms = ray_terms(spread_over_pupil(INNER), 1.0, order_of(bend))
-    own, rays = terms[:, :TERMS], terms[:, TERMS:] @ bend
-    rays = rays - own @ np.linalg.lstsq(own, rays, rcond=None)[0]
-    return float(np.linalg.norm(rays, axis=1).mean())
 
 
 def _largest(bend: np.ndarray) -> float:

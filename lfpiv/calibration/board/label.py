@@ -272,5 +272,5 @@ def _sample(measured: dict[int, DotFit], rejected: np.ndarray, model: LensIntegr
         diameter_mm=model.shared.diameter_mm,
         blur_px=model.shared.blur_px,
         left_over_mm=beside,
-        shared_error_mm=float(np.hypot(shared_error(fits, beside, pitch), model.shared.doubt_mm)),
+        shared_error_mm=shared_error(fits, beside, pitch),
     )
