@@ -66,9 +66,18 @@ def measure(driver: webdriver.Chrome, address: str, server: int) -> None:
         time.sleep(0.2)
     time.sleep(2)
     plane, level = (driver.execute_script(f"return trame.state.get('{name}')") for name in ("r_box", "r_ends"))
-    for name, (low, high) in {"r_z": plane[2][:2], "r_level": level[:2], "r_opacity": (0.1, 1)}.items():
+    moved = {
+        "r_z": plane[2][:2],
+        "r_level": level[:2],
+        "r_opacity": (0.1, 1),
+        "r_length": (0.2, 6),
+        "r_lines": (10, 300),
+    }
+    for name, (low, high) in moved.items():
+        driver.execute_script(f"trame.state.set('r_arrows', {str(name == 'r_length').lower()})")
         # every other step lies in the upper half, so that each picture differs clearly
         values = [low + (high - low) * (0.3 + 0.2 * step / STEPS + 0.2 * (step % 2)) for step in range(STEPS)]
+        values = [round(value) for value in values] if name == "r_lines" else values
         before = cpu_s(server)
         times = driver.execute_async_script(MOVE, name, values)
         used = 1000 * (cpu_s(server) - before) / STEPS

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from lfpiv.errors import InputError, printable
-from lfpiv.progress import PROGRESS_FILE, Progress
+from lfpiv.progress import Progress, record
 from lfpiv.quantities import duration, quantity
 from lfpiv.warn import name_pairs
 
@@ -30,9 +29,6 @@ LOG_EVERY_S = 10.0
 """Shortest time between log lines of a step without a terminal [s]."""
 LEAST_FRACTION = 0.02
 """Smallest finished fraction of a step for an estimate of its remaining time."""
-
-RECORD_EVERY_S = 0.2
-"""Shortest time between two lines of a step in the file that `PROGRESS_FILE` names [s]."""
 
 LISTED_PAIRS = 20
 """Largest number of pairs listed at the end of a run."""
@@ -83,7 +79,7 @@ class Output:
                 with _bars(console) as update:
                     yield update
             else:
-                yield _recorded(_log_lines(), os.environ.get(PROGRESS_FILE))
+                yield _recorded(_log_lines())
         finally:
             for logger in loggers:
                 logger.removeHandler(handler)
@@ -147,19 +143,12 @@ def _log_lines() -> Progress:
     return update
 
 
-def _recorded(update: Progress, path: str | None) -> Progress:
-    """Return a progress that is also appended to a file, if one is named."""
-    if not path:
-        return update
-    last: dict[str, float] = {}
+def _recorded(update: Progress) -> Progress:
+    """Return a progress that is also recorded for the studio."""
 
     def both(step: str, fraction: float) -> None:
         update(step, fraction)
-        now = time.time()
-        if fraction >= 1 or now - last.get(step, 0.0) >= RECORD_EVERY_S:
-            last[step] = now
-            with contextlib.suppress(OSError), open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"step": step, "fraction": round(fraction, 4), "at": round(now, 2)}) + "\n")
+        record(step, fraction)
 
     return both
 

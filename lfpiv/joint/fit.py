@@ -101,7 +101,7 @@ def fit_pair(
     steps = LightSteps(model)
     movement = DisplacementSteps(model, _curvature_rays(steps, len(model.weights.cameras)))
     alone = sum(one.misfit[-1] for one in found)
-    first, number, done, light = nodes, 0, 0, Light(model.lit)
+    first, number, done, spent, light = nodes, 0, 0, 0, Light(model.lit)
     while number < len(ROUNDS):
         now = ROUNDS[number]
         if now.fresh:
@@ -109,15 +109,15 @@ def fit_pair(
         light = steps.epochs(light, model.transports(nodes), now.epochs)
         step = movement.step(light.values, nodes, now.relaxation, now.steps, settled=now.settled)
         nodes, ratio, number = nodes + step.change, step.misfit / alone, number + 1
-        done += 1
+        done, spent = done + 1, spent + now.epochs
         moved = float(np.abs(model.field.values(step.change)).mean())
         log.debug("round %d: misfit ratio %.3f, moved by %.3f voxel", number, ratio, moved)
-        if progress is not None:
-            progress(done / (len(ROUNDS) + JUDGED))
         if number == JUDGED and ratio > LOST and model.sieve_voxel > 0 and model.rho is None:
             model.rho = _loss(model, found, nodes)
             if model.rho is not None:
                 nodes, number = first, 0
+        if progress is not None:  # epochs take the time of a round
+            progress(spent / (spent + sum(coming.epochs for coming in ROUNDS[number:])))
         if not now.fresh and moved < SETTLED_VOXEL:
             break
     residuals = movement.residuals(light.values, model.transports(nodes), unlike=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,36 @@ def open_results(folder: str | Path, *, pairs: tuple[int, int | None] | None = N
     path = Path(folder)
     if stores.is_store(path):
         return stores.open_store(path, pairs)
-    files = StackedFiles(path, pairs)
+    return _stacked(StackedFiles(path, pairs))
+
+
+def open_readable(folder: str | Path, *, every: bool = False) -> tuple[xr.Dataset, dict[Path, str]]:
+    """Open results as `open_results` does, without the files that are damaged or differ from most others.
+
+    Every file is read once with `every`, or where one of those that are compared is wrong.
+
+    Returns
+    -------
+    results : Dataset
+    left_out : dict
+        Path of each file that is left out, with the reason.
+
+    Raises
+    ------
+    InputError
+        If no file can be read.
+    """
+    left_out: dict[Path, str] = {}
+    with contextlib.suppress(InputError):
+        if not every:
+            return open_results(folder), left_out
+    if stores.is_store(Path(folder)):
+        return open_results(folder), left_out
+    return _stacked(StackedFiles(Path(folder), left_out=left_out)), left_out
+
+
+def _stacked(files: StackedFiles) -> xr.Dataset:
+    """Return the variables of many files, which are read lazily."""
     stacks = {name: indexing.LazilyIndexedArray(_Stack(files, name)) for name in files.names}
     results = files.dataset(stacks)
     if importlib.util.find_spec("dask") is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -51,6 +52,9 @@ class StackedFiles:
         Folder of the run.
     pairs : tuple, optional
         (A, B): only pairs A to B - 1; B may be None.
+    left_out : dict, optional
+        Given a dictionary, every file is read in whole, files that are damaged or differ from most others are left out,
+        and the dictionary gets their paths with the reasons.
 
     Raises
     ------
@@ -58,9 +62,16 @@ class StackedFiles:
         If the folder or the pairs do not exist, or a file that is compared does not fit the first one.
     """
 
-    def __init__(self, folder: Path, pairs: tuple[int, int | None] | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        pairs: tuple[int, int | None] | None = None,
+        left_out: dict[Path, str] | None = None,
+    ):
         self.folder = folder / "vectors"
         self.dimension, self.numbers, self.width = _listed(folder, pairs)
+        if left_out is not None:
+            self.numbers = self._fitting(left_out)
         first = netcdf.read_vectors(self.path(0))
         try:
             depends_on = read_object(first.attrs.get("depends_on", "{}"))
@@ -83,6 +94,34 @@ class StackedFiles:
         last, most = len(self.numbers) - 1, CHECKED_FILES - 1
         for place in range(1, last + 1) if last <= most else {last * k // most for k in range(1, most + 1)}:
             self._compare(place, _read_signature(self.path(place)))
+
+    def _fitting(self, left_out: dict[Path, str]) -> array[int]:
+        """Return the numbers of the files that belong to the largest group of equal settings, axes and variables."""
+        groups: list[list[tuple[int, Signature]]] = []
+        for place, number in enumerate(self.numbers):
+            path = self.path(place)
+            try:
+                netcdf.read_vectors(path)
+                signature = _read_signature(path)
+            except InputError as error:
+                left_out[path] = str(error)
+                continue
+            for group in groups:
+                with contextlib.suppress(InputError):
+                    _check_equal(signature, group[0][1])
+                    group.append((number, signature))
+                    break
+            else:
+                groups.append([(number, signature)])
+        if not groups:
+            raise InputError(next(iter(left_out.values())))
+        largest = max(groups, key=len)
+        for _, signature in (item for group in groups if group is not largest for item in group):
+            try:
+                _check_equal(signature, largest[0][1])
+            except InputError as error:
+                left_out[signature.path] = str(error)
+        return array("q", [number for number, _ in largest])
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -21,7 +21,7 @@ from lfpiv.errors import StorageError
 from lfpiv.experiment.recording import Frame
 from lfpiv.joint.field import joint_field
 from lfpiv.joint.vectors import is_joint
-from lfpiv.progress import StepProgress, part_of
+from lfpiv.progress import StepProgress, part_of, record
 from lfpiv.results.folder import Folder
 from lfpiv.results.pair_files import PairFiles, PairVolumes
 from lfpiv.runs import belonging, pair_figures
@@ -68,7 +68,7 @@ class PairWork(FrameWork):
         try:
             for number, (pair, coming) in enumerate(_with_next(pairs)):
                 self._read_ahead(pair, coming)
-                found = self._compute(pair, frames, partial(progress, number))
+                found = self._compute(pair, frames, self._recorded(pair, partial(progress, number)))
                 if computed is not None:
                     yield computed.outcome()
                 computed = found
@@ -79,6 +79,16 @@ class PairWork(FrameWork):
             self.images.start(())
         frames.clear()
         self.fits.last = None
+
+    def _recorded(self, pair: int, progress: StepProgress) -> StepProgress:
+        """Return the progress of a pair that is also recorded for the studio."""
+
+        def both(fraction: float) -> None:
+            record(self.experiment.name_of(pair), fraction, pair)
+            progress(fraction)
+
+        both(0.0)
+        return both
 
     def frames(self, stored: Collection[int] = ()) -> Frames:
         """Return the frames of pairs to come, of which none is known yet."""

@@ -11,19 +11,24 @@ from trame.widgets import vuetify3 as v3
 
 DIGITS = 5
 """Digits of a slider's value in the field beside it."""
+TURNS = {
+    "left": (-15.0, 0.0, 1.0), "right": (15.0, 0.0, 1.0), "up": (0.0, 15.0, 1.0), "down": (0.0, -15.0, 1.0),
+    "closer": (0.0, 0.0, 1.2), "farther": (0.0, 0.0, 1 / 1.2),
+}  # fmt: skip
+"""Name of a step -> angles to the right and up [degree], and zoom."""
+KEYS = dict(zip(("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "+", "-"), TURNS, strict=True))
+"""Key that makes a step of a view."""
 
 
 def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str = "", **more: Any) -> None:
     """Show a slider of a value of the state, with a field beside it in which the value is typed."""
     with html.Div(classes="lf-slider", **more):
-        html.Label(f"{label}{f' [{unit}]' if unit else ''}", for_=f"s-{name}")
-        v3.VSlider(
-            v_model=(name,), min=low, max=high, step=step, density="compact", hide_details=True, id=f"s-{name}",
-            thumb_size=14, track_size=3, aria_label=label,
-        )  # fmt: skip
+        html.Label(f"{label}{f' [{unit}]' if unit else ''}", raw_attrs=[f'for="s-{name}"'])
+        told = f"{name} = Number($event.target.value)"
+        html.Input(type="range", min=low, max=high, step=step, value=(name,), id=f"s-{name}", input=told)
         html.Input(
             type="number", value=(f"+Number({name}).toPrecision({DIGITS})",), step="any", id=f"n-{name}",
-            aria_label=f"{label}, typed", change=f"{name} = Number($event.target.value)",
+            raw_attrs=[f'aria-label="{label}, typed"'], change=told,
         )  # fmt: skip
 
 
@@ -45,8 +50,17 @@ def button(label: str, click: Any, icon: str = "", **more: Any) -> None:
     v3.VBtn(label, click=click, size="small", variant="tonal", **options, **more)
 
 
-def linked(pictures: Sequence[Any], name: str, titles: Mapping[str, str], also: Any = lambda: True) -> list[Any]:
-    """Show pictures beside each other, whose cameras are the same: title -> when it is seen.
+def turn(camera: Any, name: str) -> None:
+    """Turn a camera by a step."""
+    right, up, closer = TURNS[name]
+    camera.Azimuth(right)
+    camera.Elevation(up)
+    camera.OrthogonalizeViewUp()
+    camera.zoom(closer)
+
+
+def linked(plotters: Sequence[Any], name: str, titles: Mapping[str, str], also: Any = lambda: True) -> list[Any]:
+    """Show what plotters draw beside each other, with one camera, turned by hand or keys: title -> when it is seen.
 
     When one is turned all are drawn anew if `also` says so.
     """
@@ -56,15 +70,23 @@ def linked(pictures: Sequence[Any], name: str, titles: Mapping[str, str], also: 
         for view in views if also() else ():
             view.update()
 
+    def key(pressed: str) -> None:
+        turn(plotters[0].camera, KEYS[pressed])
+        for plotter, view in zip(plotters, views, strict=True):
+            plotter.renderer.ResetCameraClippingRange()
+            view.update()
+
     for number, (title, shown) in enumerate(titles.items()):
-        with html.Div(classes="lf-view", v_show=shown):
+        pressed = f"{list(KEYS)}.includes($event.key) && ($event.preventDefault(), trigger('{name}_key', [$event.key]))"
+        said = ['role="group"', f'aria-label="{name}: arrow keys turn it, + and - come closer and go farther"']
+        with html.Div(classes="lf-view", v_show=shown, keydown=pressed, raw_attrs=said):
             html.Div(title, classes="lf-name", id=f"{name}-{number}")
-            views.append(picture(pictures[number].plotter, f"{name}_{number}", turned))
+            views.append(
+                vtk.VtkRemoteView(
+                    plotters[number].render_window, ref=f"{name}_{number}", interactive_ratio=1,
+                    interactor_events=(f"{name}_{number}_events", ["Animation", "EndAnimation"]),
+                    Animation=turned, EndAnimation=turned,
+                )
+            )  # fmt: skip
+    views[0].server.trigger(f"{name}_key")(key)
     return views
-
-
-def picture(plotter: Any, name: str, turned: Any = None) -> Any:
-    """Show what a plotter draws; `turned` is called when it was turned by hand."""
-    events = {"interactor_events": (f"{name}_events", ["Animation", "EndAnimation"])} if turned else {}
-    events |= {"Animation": turned, "EndAnimation": turned} if turned else {}
-    return vtk.VtkRemoteView(plotter.render_window, ref=name, interactive_ratio=1, **events)

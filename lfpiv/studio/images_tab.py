@@ -22,7 +22,7 @@ class Picture(AbstractElement):  # type: ignore[misc]  # trame has no types
 
     def __init__(self, **options: Any) -> None:
         super().__init__("lf-image", **options)
-        self._attr_names += ["image", "low", "high", "marks", "name", "smooth"]
+        self._attr_names += ["image", "low", "high", "marks", "name", "smooth", "region"]
         self._event_names += ["point", "pick"]
 
 
@@ -39,11 +39,12 @@ class Images:
                 "i_high": 1.0, "i_top": 1.0, "i_marks": [], "i_lattice": True, "i_dots": True, "i_pixels": True,
                 "i_axes": True, "i_facts": [], "i_chart": "", "i_u": 0.0, "i_v": 0.0, "i_radius": 1.0,
                 "i_follow": True, "i_pupil": None, "i_pupil_high": 1.0, "i_z": 0.0, "i_depth": [-1.0, 1.0],
-                "i_plane": None, "i_both": False, "i_busy": "", "i_source": "",
+                "i_plane": None, "i_both": False, "i_busy": "", "i_source": "", "i_place": None, "i_region": [],
             }
         )  # fmt: skip
         change = self.state.change
         change("tab")(lambda **_: self._open())
+        change("i_place")(lambda **_: session.guarded(self._go)())
         change("i_camera", "i_name")(lambda **_: self._show())
         change("i_lattice", "i_dots", "i_pixels", "i_axes")(lambda **_: session.guarded(self._mark)())
         change("i_u", "i_v")(lambda **_: session.guarded(self._pupil)())
@@ -75,6 +76,7 @@ class Images:
             z, grid = float(raw.experiment.grid.centre_mm[2]), raw.experiment.grid
             half = grid.shape[0] * grid.voxel_mm / 2
             self.state.i_depth, self.state.i_z = [z - half, z + half], z
+            self._go()
             self._show()
 
     def _show(self) -> None:
@@ -84,6 +86,18 @@ class Images:
             s.i_names = raw.names(s.i_camera)
             s.i_name = s.i_name if s.i_name in s.i_names else s.i_names[0]
             self.session.start(self._show_aside(raw, s.i_camera, s.i_name))
+
+    def _go(self) -> None:
+        """Show the camera, the image and the region that a warning names, as soon as the experiment is read."""
+        raw, s, place = self.raw, self.state, self.state.i_place
+        if raw is None or not place or place["camera"] not in s.i_cameras:
+            return
+        s.i_place, s.i_camera = None, place["camera"]
+        if place["image"] in raw.names(s.i_camera):
+            s.i_name = place["image"]
+        corners = np.reshape(place["region"], (-1, 2))
+        found = raw.recorded_px(s.i_camera, corners) if len(corners) else corners
+        s.i_region = [*found.min(0).tolist(), *found.max(0).tolist()] if len(found) else []
 
     async def _show_aside(self, raw: RawImages, camera: str, name: str) -> None:
         """Show an image at once, and what is seen in it as soon as the camera is decoded."""
@@ -194,7 +208,7 @@ class Images:
                 controls.switch("i_both", "two cameras at once: red and cyan", id="i-both")
             with html.Div(classes="lf-main"), html.Div(classes="lf-pictures"):
                 Picture(
-                    image=("i_image",), low=("i_low",), high=("i_high",), marks=("i_marks",),
+                    image=("i_image",), low=("i_low",), high=("i_high",), marks=("i_marks",), region=("i_region",),
                     name=("i_camera + ', ' + i_name",), point=(self.follow, "[$event]"), id="i-picture",
                 )  # fmt: skip
                 with html.Div(classes="lf-side"):

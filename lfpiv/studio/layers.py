@@ -9,6 +9,9 @@ from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
 import lfpiv
 
+MOVING_ARROWS, MOVING_LINES = 1500, 25
+"""Arrows, and lengths of streamlines, that are drawn in time while something moves."""
+
 
 def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
     """Return the vectors of one pair or instant, or a statistic over all of them: "mean" or "fluctuations"."""
@@ -91,38 +94,48 @@ def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.Pol
     return pv.wrap(edges.GetOutput())
 
 
-def arrows(grid: pv.ImageData, every: int, length: float, colour: str, flagged: bool = False) -> pv.PolyData:
+def arrows(
+    grid: pv.ImageData, every: int, length: float, colour: str, flagged: bool = False, moving: bool = False
+) -> pv.PolyData:
     """Return arrows on every n-th vector along each axis, or on the replaced vectors among them.
 
-    The fastest arrow is as long as `length` distances of the arrows.
+    The fastest arrow is as long as `length` distances of the arrows. While something moves at most `MOVING_ARROWS` are
+    drawn.
     """
-    index = [np.arange((n - 1) % every // 2, n, every) for n in grid.dimensions]
-    x, y, z = np.meshgrid(*index, indexing="ij")
-    chosen = (x + grid.dimensions[0] * (y + grid.dimensions[1] * z)).ravel()
+    step = every
+    while moving and np.prod([-(-n // step) for n in grid.dimensions]) > MOVING_ARROWS:
+        step += every
+    index = [np.arange((n - 1) % step // 2, n, step) for n in grid.dimensions]
+    places = np.stack(np.meshgrid(*index, indexing="ij"), axis=-1).reshape(-1, 3)
+    chosen = places @ np.cumprod([1, *grid.dimensions[:2]])
     good = grid["valid"][chosen] > 0.5 if "valid" in grid.point_data else np.ones(len(chosen), bool)
-    chosen = chosen[(good != flagged) & np.isfinite(grid["speed"][chosen])]
-    cloud = pv.PolyData(np.asarray(grid.points)[chosen]) if len(chosen) else pv.PolyData()
-    if not len(chosen):
-        return cloud
+    kept = (good != flagged) & np.isfinite(grid["speed"][chosen])
+    if not kept.any():
+        return pv.PolyData()
+    cloud = pv.PolyData((grid.origin + places[kept] * grid.spacing).astype(np.float32))
     for name in {"velocity", "speed", colour}:
-        cloud[name] = grid[name][chosen]
+        cloud[name] = grid[name][chosen[kept]]
     fastest = float(np.nanmax(grid["speed"], initial=0.0)) or 1.0
     factor = length * every * min(grid.spacing) / fastest
     return cloud.glyph(
-        orient="velocity", scale="speed", factor=factor, geom=pv.Arrow(tip_resolution=8, shaft_resolution=6)
+        orient="velocity", scale="speed", factor=factor, geom=pv.Arrow(tip_resolution=5, shaft_resolution=4)
     )
 
 
-def stream_lines(grid: pv.ImageData, seeds: int, colour: str) -> pv.PolyData:
-    """Return streamlines from a number of points in the volume, drawn as tubes."""
+def stream_lines(grid: pv.ImageData, seeds: int, colour: str, moving: bool = False) -> pv.PolyData:
+    """Return streamlines from a number of points in the volume, drawn as tubes.
+
+    While something moves they are thin, and all of them together as long as `MOVING_LINES` are at rest.
+    """
     filled = slim(grid, colour)
     filled["velocity"] = np.nan_to_num(grid["velocity"])
     low, high = np.array(grid.bounds[::2]), np.array(grid.bounds[1::2])
     places = low + (high - low) * np.random.default_rng(0).random((seeds, 3))
+    longest = 4 * grid.length * (min(1.0, MOVING_LINES / seeds) if moving else 1.0)
     lines = filled.streamlines_from_source(
-        pv.PolyData(places), vectors="velocity", integration_direction="both", max_length=4 * grid.length
+        pv.PolyData(places), vectors="velocity", integration_direction="both", max_length=longest
     )
-    return lines.tube(radius=grid.length / 500, n_sides=6) if lines.n_points else lines
+    return lines if moving or not lines.n_points else lines.tube(radius=grid.length / 500, n_sides=4)
 
 
 def points_of(table: xr.Dataset, columns: tuple[str, str, str]) -> pv.PolyData:

@@ -90,8 +90,10 @@ class Picture:
         plotter.camera.SetWindowCenter(0.0, -0.08)  # room for the colour scale below
         return cls(plotter)
 
-    def show(self, whole: pv.ImageData, look: Look, clouds: dict[str, pv.PolyData], title: str) -> None:
-        """Draw what differs from what is drawn."""
+    def show(
+        self, whole: pv.ImageData, look: Look, clouds: dict[str, pv.PolyData], title: str, moving: bool = False
+    ) -> None:
+        """Draw what differs from what is drawn; less of what would take long while something moves."""
         self.drawn["whole"] = whole  # its id names it as long as it lives
         grid, key = whole, (id(whole), look.hide_replaced, look.uncertainty)
         if self.drawn.get("trusted key") != key:
@@ -99,7 +101,8 @@ class Picture:
         grid = self.drawn["trusted"]
         limits = look.limits or self.limits(whole, look.colour)
         cmap = look.colours or ("coolwarm" if look.colour in SIGNED else "viridis")
-        ink, paint = INK[look.theme], {"cmap": cmap, "clim": list(limits), "scalars": look.colour}
+        ink = INK[look.theme]
+        paint: dict[str, Any] = {"cmap": cmap, "clim": list(limits), "scalars": look.colour}
         shade = (look.colour, cmap, limits, look.theme, title)
         bar = {
             "title": f"{title}\n", "color": ink, "vertical": False, "fmt": "%.3g", "n_labels": 5,
@@ -121,17 +124,19 @@ class Picture:
             shown.opacity, shown.interpolation = look.opacity, "Phong"
         self._layer(
             "arrows", look.arrows and (key, look.arrows, look.length, shade),
-            lambda: layers.arrows(grid, look.arrows, look.length, look.colour), **paint,
+            lambda: layers.arrows(grid, look.arrows, look.length, look.colour, moving=moving), moving, **paint,
         )  # fmt: skip
         self._layer(
             "replaced", look.replaced and (id(whole), look.arrows, look.length),
-            lambda: layers.arrows(whole, max(look.arrows, 1), look.length, "speed", True), color=REPLACED,
+            lambda: layers.arrows(whole, max(look.arrows, 1), look.length, "speed", True, moving), moving,
+            color=REPLACED,
         )  # fmt: skip
         self._layer(
             "lines", look.lines and (key, look.lines, shade),
-            lambda: layers.stream_lines(grid, look.lines, look.colour), **paint,
+            lambda: layers.stream_lines(grid, look.lines, look.colour, moving), moving, **paint,
         )  # fmt: skip
-        for name, style in (("particles", {"point_size": 4.0}), ("tracks", {"line_width": 2.0})):
+        styles: dict[str, dict[str, Any]] = {"particles": {"point_size": 4.0}, "tracks": {"line_width": 2.0}}
+        for name, style in styles.items():
             cloud = clouds.get(name) if getattr(look, name) else None
             colour = paint if cloud is not None and look.colour in cloud.point_data else {"color": ink}
             self._layer(name, cloud is not None and (id(cloud), shade), lambda cloud=cloud: cloud, **colour, **style)
@@ -145,20 +150,20 @@ class Picture:
             self.drawn |= {"limits key": (id(grid), name), "limits": own_limits(grid, name)}
         return self.drawn["limits"]  # type: ignore[no-any-return]
 
-    def _layer(self, name: str, key: Any, make: Any, **style: Any) -> None:
+    def _layer(self, name: str, key: Any, make: Any, moving: bool = False, **style: Any) -> None:
         """Draw a layer unless it is drawn from the same; remove it without a key."""
         if not key:
             if self.drawn.pop(name, None) is not None:
                 self.plotter.remove_actor(name, render=False)
             return
-        if self.drawn.get(name) == key:
+        if self.drawn.get(name) in (key, (moving, key)):
             return
         mesh = make()
         if not mesh.n_points:
             self.plotter.remove_actor(name, render=False)
         else:
             self.plotter.add_mesh(mesh, name=name, show_scalar_bar=False, reset_camera=False, render=False, **style)
-        self.drawn[name] = key
+        self.drawn[name] = (moving, key) if moving else key
 
     def _frame(self, grid: pv.ImageData, ink: str, ground: str, bar: dict[str, Any], paint: dict[str, Any]) -> None:
         """Draw background, box, axes and colour scale."""
@@ -218,20 +223,19 @@ def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tu
         (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
     ]
     values = "".join(f"    {name}={value!r},\n" for name, value in stated)
-    clouds = ""
+    clouds, number = "", look.moment if look.moment.isdigit() else None
+    chosen = "" if number is None else f", pairs=({number}, {number} + 1)"  # other files may be damaged
     if look.particles:
-        table = f"lfpiv.open_particles(results, pairs=({look.moment}, {look.moment} + 1))"
-        clouds += f'    clouds["particles"] = points_of({table}, ("x", "y", "z"))\n'
+        clouds += f'    clouds["particles"] = points_of(lfpiv.open_particles(results{chosen}), ("x", "y", "z"))\n'
     if look.tracks:
-        until = look.moment if look.moment.isdigit() else None
-        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), ("x", "y", "z"), {until})\n'
+        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), ("x", "y", "z"), {number})\n'
     return (
         '"""Draw vectors as they were seen in lfpiv studio. Needs lfpiv and pyvista."""\n\n'
         "from __future__ import annotations\n\nfrom dataclasses import dataclass, field\nfrom typing import Any\n"
         f"{body}\n\nBACKGROUND = {{{own.replace('layers.', '')}\n\n\n"
         f"RESULTS = {list(results)!r}\nLOOK = Look(\n{values})\n\n"
         "for number, results in enumerate(RESULTS):\n"
-        "    grid = grid_of(field_at(lfpiv.open_results(results), LOOK.moment))\n"
+        f"    grid = grid_of(field_at(lfpiv.open_results(results{chosen}), LOOK.moment))\n"
         f"    clouds = {{}}\n{clouds}"
         f"    picture = Picture.empty({tuple(size)!r})\n"
         f"    picture.show(grid, LOOK, clouds, {title!r})\n"

@@ -14,7 +14,7 @@ from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
-from lfpiv.studio import delivery
+from lfpiv.studio import delivery, warning_cards
 from lfpiv.studio.access import Places
 from lfpiv.studio.form_tab import Form
 from lfpiv.studio.images_tab import Images
@@ -74,7 +74,13 @@ def routes(session: Session) -> list[web.RouteDef]:
             raise web.HTTPNotFound
         return web.Response(body=content, content_type="application/octet-stream")
 
-    return [web.get(r"/data/{number:\d+}", picture)]
+    async def words(request: web.Request) -> web.Response:
+        content = warning_cards.page(request.match_info["name"])
+        if content is None:
+            raise web.HTTPNotFound(text="This page is not installed; it lies in docs/ of the sources of lfpiv.")
+        return web.Response(text=content, content_type="text/html")
+
+    return [web.get(r"/data/{number:\d+}", picture), web.get(r"/pages/{name:\w+}", words)]
 
 
 def roots_of(given: Path) -> tuple[Path, ...]:

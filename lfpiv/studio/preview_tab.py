@@ -226,7 +226,7 @@ class Preview:
                 html.Div("{{ t_voxels }}", classes="lf-note")
                 html.H3("Correlation and SMART")
                 with html.Div(classes="lf-slider"):
-                    html.Label("windows of the passes [voxel]", for_="t-windows")
+                    html.Label("windows of the passes [voxel]", raw_attrs=['for="t-windows"'])
                     html.Input(
                         v_model=("t_windows",),
                         placeholder="[32, 16, 12, 12]",
@@ -246,4 +246,5 @@ class Preview:
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
             with html.Div(classes="lf-main lf-double", v_show="t_after"), html.Div(classes="lf-views"):
                 names = [f"{name}: {{{{ t_{name} }}}}" for name in ("before", "after")]
-                self.views = controls.linked(self.pictures, "preview", dict.fromkeys(names, "t_after"))
+                plotters = [picture.plotter for picture in self.pictures]
+                self.views = controls.linked(plotters, "preview", dict.fromkeys(names, "t_after"))

@@ -121,7 +121,7 @@ class Files:
         with v3.VDialog(v_model=("r_script_shown",), max_width=900):
             with v3.VCard(title="This picture as Python", classes="pa-3"):
                 html.Textarea(
-                    v_model=("r_script",), readonly=True, rows=18, id="r-script", aria_label="script",
+                    v_model=("r_script",), readonly=True, rows=18, id="r-script", raw_attrs=['aria-label="script"'],
                     style="width:100%;font-family:monospace;font-size:12px",
                 )  # fmt: skip
                 with html.Div(classes="lf-buttons"):

@@ -15,6 +15,7 @@ import xarray as xr
 
 import lfpiv
 from lfpiv.errors import InputError
+from lfpiv.results.reader import open_readable
 from lfpiv.studio import charts, controls, layers, look
 from lfpiv.studio.field_names import LABELS, SURFACES, title_of
 from lfpiv.studio.results_files import FRAMES_PER_S, Files
@@ -22,13 +23,10 @@ from lfpiv.studio.session import Session
 
 COLOURS = ("", "viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
 CLOUDS = ("particles", "tracks")
+MOST_ARROWS = 40
+"""Largest number of arrows along an axis that the slider gives: more fill the picture, and take seconds."""
 REST_S = 0.25
 """Time without a change after which a picture is drawn with all its pixels."""
-TURNS = {
-    "left": (-15.0, 0.0, 1.0), "right": (15.0, 0.0, 1.0), "up": (0.0, 15.0, 1.0), "down": (0.0, -15.0, 1.0),
-    "closer": (0.0, 0.0, 1.2), "farther": (0.0, 0.0, 1 / 1.2),
-}  # fmt: skip
-"""Name of a step -> angles to the right and up [degree], and zoom."""
 
 
 class Results:
@@ -38,6 +36,7 @@ class Results:
         self.session, self.state = session, session.state
         self.open, self.grid = lru_cache(2)(self._results), lru_cache(40)(self._grid)
         self.cloud = lru_cache(4)(self._cloud)
+        self.doubtful: set[str] = set()
         self.pictures = (look.Picture.empty(), look.Picture.empty())
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
         self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
@@ -48,10 +47,10 @@ class Results:
                 "r_colours": "", "r_own": True, "r_low": 0.0, "r_high": 1.0, "r_on_x": False, "r_on_y": False,
                 "r_on_z": True, "r_x": 0.0, "r_y": 0.0, "r_z": 0.0, "r_box": [[0, 1, 0.1]] * 3, "r_surface": "",
                 "r_surfaces": [], "r_level": 0.0, "r_ends": [0.0, 1.0, 0.01], "r_opacity": 0.6, "r_arrows": False,
-                "r_every": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
+                "r_every": 1, "r_fewest": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
                 "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
                 "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
-                "r_open": "",
+                "r_open": "", "r_left": {},
             }
         )  # fmt: skip
         watched = """
@@ -80,6 +79,8 @@ class Results:
             return
         for kept in (self.open, self.grid, self.cloud):
             kept.cache_clear()
+        self.doubtful.clear()
+        self.state.r_left = {}
         self.charted, places, folder = (), self.session.places, self.session.results
         others = [{"title": places.name(path), "value": str(path)} for path in places.results()]
         self.state.r_others = [{"title": "nothing", "value": ""}, *others]
@@ -100,11 +101,21 @@ class Results:
 
     def _results(self, folder: str) -> xr.Dataset:
         """Return the vectors of a folder, which lies in those given."""
-        return lfpiv.open_results(self.session.places.within(folder))
+        results, left_out = open_readable(self.session.places.within(folder), every=folder in self.doubtful)
+        cards = [{"name": path.name, "why": why} for path, why in left_out.items()]
+        self.state.r_left = {**self.state.r_left, folder: cards}
+        return results
 
     def _grid(self, folder: str, moment: str) -> pv.ImageData:
         """Return the fields of a moment as a grid."""
-        return layers.grid_of(layers.field_at(self.open(folder), moment))
+        try:
+            return layers.grid_of(layers.field_at(self.open(folder), moment))
+        except InputError:
+            if folder in self.doubtful:
+                raise
+        self.doubtful.add(folder)  # a file is wrong of which the opening read the first bytes only
+        self.open.cache_clear()
+        return self._grid(folder, moment)
 
     def _cloud(self, name: str, folder: str, moment: str) -> pv.PolyData | None:
         """Return particles or tracks at a moment; None for particles of a statistic."""
@@ -125,7 +136,7 @@ class Results:
         state.r_fields = [{"title": title_of(name), "value": name} for name in dict.fromkeys(names)]
         some = [name for name in SURFACES if name in grid.array_names]
         state.r_surfaces = [{"title": title_of(name) if name else "none", "value": name} for name in ("", *some)]
-        state.r_every = max(1, round(max(grid.dimensions) / 16))
+        state.r_every, state.r_fewest = (max(1, round(max(grid.dimensions) / n)) for n in (16, MOST_ARROWS))
         state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
         self._range_of_level()
 
@@ -191,7 +202,7 @@ class Results:
         grid = self.grid(self.folders[0], wanted.moment)
         return replace(wanted, limits=self.pictures[0].limits(grid, wanted.colour))
 
-    def show(self, wanted: look.Look) -> None:
+    def show(self, wanted: look.Look, moving: bool = False) -> None:
         """Change the pictures to a look, without sending them."""
         wanted = self.alike(wanted)
         for folder, picture in zip(self.folders, self.pictures, strict=False):
@@ -199,14 +210,14 @@ class Results:
             if wanted.colour not in grid.array_names:
                 raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
             clouds = {name: self.cloud(name, folder, wanted.moment) for name in CLOUDS if getattr(wanted, name)}
-            picture.show(grid, wanted, clouds, title_of(wanted.colour))
+            picture.show(grid, wanted, clouds, title_of(wanted.colour), moving)
 
     def draw(self, moving: bool = False) -> None:
         """Draw what the state asks for, in both pictures if two runs are compared; faster while something moves."""
         wanted, folders = self.wanted, self.folders
         try:
             if self.session.results is not None:
-                self.show(wanted)
+                self.show(wanted, moving)
         finally:
             for picture, view in zip(self.pictures, self.views[: len(folders)], strict=False):
                 picture.plotter.set_background(look.BACKGROUND[wanted.theme])
@@ -256,14 +267,8 @@ class Results:
 
     def look_along(self, name: str) -> None:
         """Turn the camera to a view by its name, or by steps."""
-        plotter = self.pictures[0].plotter
-        camera = plotter.camera
-        if name in TURNS:
-            right, up, closer = TURNS[name]
-            camera.Azimuth(right)
-            camera.Elevation(up)
-            camera.OrthogonalizeViewUp()
-            camera.zoom(closer)
+        if name in controls.TURNS:
+            controls.turn(self.pictures[0].plotter.camera, name)
         else:
             self.pictures[0].look_along(name, self.grid(str(self.session.results), self.wanted.moment).bounds)
         for picture, view in zip(self.pictures, self.views, strict=True):
@@ -281,7 +286,8 @@ class Results:
             with html.Div(classes="lf-main"), html.Div(classes="lf-views"):
                 other = "{{ r_others.find((run) => run.value === r_other)?.title }}"
                 names = {"{{ results_name }}": "true", other: "!!r_other"}
-                self.views = controls.linked(self.pictures, "results", names, lambda: bool(self.state.r_other))
+                plotters = [picture.plotter for picture in self.pictures]
+                self.views = controls.linked(plotters, "results", names, lambda: bool(self.state.r_other))
 
     def _moment_controls(self) -> None:
         html.Div(
@@ -289,6 +295,10 @@ class Results:
             classes="lf-note",
         )  # fmt: skip
         controls.choice("r_open", "results", ("r_others.slice(1)",), id="r-open", v_if="r_others.length > 1")
+        with html.Template(v_for="cards in r_left"):
+            with html.Div(v_for="card in cards", key="card.name", classes="lf-card lf-left", role="alert"):
+                html.B("{{ card.name }} is left out")
+                html.Div("{{ card.why }}")
         controls.choice("r_moment", "shown", ("r_moments",), id="r-moment")
         with html.Div(v_if="r_numbers > 1"):
             controls.slider("r_step", "through the series", 0, ("r_numbers - 1",), 1)
@@ -316,7 +326,7 @@ class Results:
         html.H3("Arrows and streamlines")
         controls.switch("r_arrows", "arrows", id="r-arrows")
         with html.Div(v_if="r_arrows"):
-            controls.slider("r_every", "on every n-th vector", 1, 10, 1)
+            controls.slider("r_every", "on every n-th vector", ("r_fewest",), ("r_fewest + 9",), 1)
             controls.slider("r_length", "length", 0.2, 6, 0.1)
         controls.slider("r_lines", "streamlines", 0, 300, 5)
         with html.Div(v_if="r_has.includes('particles')"):
@@ -340,6 +350,8 @@ class Results:
         with html.Div(classes="lf-buttons"):
             for name in look.VIEWS:
                 controls.button(name, (self.look_along, f"['{name}']"))
-            for name, icon in zip(TURNS, "⟲⟳↑↓+−", strict=True):
-                controls.button(icon, (self.look_along, f"['{name}']"), title=f"turn {name}", id=f"r-turn-{name}")
+            for name, icon in zip(controls.TURNS, "⟲⟳↑↓+−", strict=True):
+                controls.button(
+                    icon, (self.look_along, f"['{name}']"), raw_attrs=[f'aria-label="turn {name}"'], id=f"r-turn-{name}"
+                )
         controls.choice("r_other", "side by side with", ("r_others",), id="r-other")

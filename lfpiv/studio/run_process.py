@@ -29,8 +29,10 @@ LOG, PROGRESS = ".run.log", ".run.jsonl"
 PAIR_STEPS = ("image pairs", "instants")
 REPORT_S = 20.0
 """Time that the report of a run takes [s]."""
-LEAST_FRACTION = 0.02
-"""Smallest finished fraction of a step from which its remaining time is told."""
+LEAST_FRACTION, SURE_FRACTION, SURE_S = 0.02, 0.1, 60.0
+"""Smallest finished fractions of a step from which its remaining time is told: after `SURE_S`, and before [s]."""
+SHOWN_PAIRS = 12
+"""Pairs, the latest, that have a bar."""
 SHOWN_LINES = 60
 """Lines of the log that are shown."""
 LARGEST_BYTES = 1 << 20
@@ -161,22 +163,34 @@ def logged_warnings(out: Path) -> list[str]:
 
 
 def stages(out: Path) -> list[dict[str, Any]]:
-    """Return the steps of a run in order: name, finished fraction, and the time left as far as it is known."""
-    steps: dict[str, dict[str, float]] = {}
+    """Return the steps of a run in order: name, finished fraction, and the time left as far as it is known.
+
+    A step of pairs has its latest `SHOWN_PAIRS` pairs, each with the same.
+    """
+    steps: dict[str, dict[str, Any]] = {}
     for line in tail(out / PROGRESS).splitlines():
         with contextlib.suppress(ValueError, KeyError, TypeError):
             item = json.loads(line)
-            step = steps.setdefault(item["step"], {"began": item["at"], "first": item["fraction"]})
-            step |= {"at": item["at"], "fraction": item["fraction"]}
-    shown = []
-    for name, step in steps.items():
-        left, seconds, part = "", None, step["fraction"] - step["first"]
-        if part >= LEAST_FRACTION and step["fraction"] < 1:
-            speed = part / max(step["at"] - step["began"], 1e-3)
-            seconds = (1 - step["fraction"]) / speed
-            left = f"about {duration(seconds)} left"
-        shown.append({"name": name, "percent": round(100 * step["fraction"], 1), "left": left, "seconds": seconds})
-    return shown
+            now = {"at": float(item["at"]), "fraction": float(item["fraction"])}
+            first = {"began": now["at"], "first": now["fraction"], "pair": item.get("pair")}
+            steps[item["step"]] = steps.get(item["step"], first) | now
+    shown = [_shown(name, step) for name, step in steps.items()]
+    pairs = [stage for stage in shown if stage["pair"] is not None]
+    stages = [stage for stage in shown if stage["pair"] is None]
+    for stage in stages:
+        stage["pairs"] = pairs[-SHOWN_PAIRS:] if stage["name"] in PAIR_STEPS else []
+    return stages
+
+
+def _shown(name: str, step: dict[str, Any]) -> dict[str, Any]:
+    """Return a step as the page shows it."""
+    seconds, part = None, step["fraction"] - step["first"]
+    taken = max(step["at"] - step["began"], 1e-3)
+    if part >= (LEAST_FRACTION if taken > SURE_S else SURE_FRACTION) and step["fraction"] < 1:
+        seconds = (1 - step["fraction"]) / part * taken
+    left = "" if seconds is None else f"about {duration(seconds)} left"
+    percent = round(100 * step["fraction"], 1)
+    return {"name": name, "percent": percent, "left": left, "seconds": seconds, "pair": step["pair"]}
 
 
 def time_left(out: Path) -> str:
@@ -188,14 +202,11 @@ def time_left(out: Path) -> str:
 
 
 def finished_warnings(out: Path) -> list[dict[str, Any]]:
-    """Return the warnings of a finished run: code, what it is about, and the sentence with the remedy."""
+    """Return the warnings of a finished run: its records, each with the sentence."""
     try:
         summary = read_object(read_text(Folder(out).summary))
     except (OSError, RecordError):
         return []
     sentences, records = (list(summary.get(name) or []) for name in ("warnings", "warning_records"))
     records = [record if isinstance(record, dict) else {} for record in [*records, *sentences][: len(sentences)]]
-    return [
-        {"code": str(record.get("code", "")), "subject": str(record.get("subject", "")), "text": str(sentence)}
-        for sentence, record in zip(sentences, records, strict=True)
-    ]
+    return [{**record, "text": str(sentence)} for sentence, record in zip(sentences, records, strict=True)]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import trame_client.widgets.html as html
 from trame.widgets import vuetify3 as v3
 
 from lfpiv.errors import InputError
-from lfpiv.studio import controls, run_process
+from lfpiv.studio import controls, run_process, warning_cards
 from lfpiv.studio.session import Session
 
 LOOK_EVERY_S = 0.5
@@ -94,7 +96,7 @@ class Runs:
         if now in ("running", "paused") or s.p_status in ("running", "paused"):
             s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
             s.p_log = "\n".join(run_process.log_lines(out))
-            s.p_warnings = [{"code": "", "subject": "", "text": text} for text in run_process.logged_warnings(out)]
+            s.p_warnings = self._cards({"text": text} for text in run_process.logged_warnings(out))
         if s.p_status in ("running", "paused") and now == "ended":
             self._ended(out)
         s.p_status = now
@@ -107,17 +109,15 @@ class Runs:
         early = "stopped; Start goes on from there" if self.stopped else "ended early; see its log"
         self.state.p_end, self.stopped = ends.get(number, early), False
         if number in (0, 3, None) and (finished := run_process.finished_warnings(out)):
-            self.state.p_warnings = finished
+            self.state.p_warnings = self._cards(finished)
         if any((out / "vectors").glob("*.nc")):
             self.session.results = out
             self.session.changed("results")
 
-    def show(self, subject: str) -> None:
-        """Show the camera that a warning is about."""
-        names = [name for name in self.state.i_cameras if name in subject]
-        if names:
-            self.state.i_camera = names[0]
-        self.state.tab = "images"
+    def _cards(self, warnings: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+        draft = self.session.draft
+        cameras = [str(camera.get("name")) for camera in draft.values.get("camera", [])] if draft is not None else []
+        return [warning_cards.card(warning, cameras) for warning in warnings]
 
     def _close(self) -> None:
         """End the run with the studio if that is asked for; otherwise leave it."""
@@ -155,15 +155,32 @@ class Runs:
                 "The run goes on without this page and without the studio; `lfpiv run` with the same file and folder "
                 "continues it.", v_if=running, classes="lf-note",
             )  # fmt: skip
-            with html.Div(v_for="stage in p_stages", key="stage.name", classes="lf-stage"):
-                html.Span("{{ stage.name }}")
-                v3.VProgressLinear(model_value=("stage.percent",), height=8, rounded=True, color="primary")
-                html.Span("{{ stage.percent }} % {{ stage.left }}", classes="lf-note")
-            with html.Div(v_for="(warning, number) in p_warnings", key="number", classes="lf-card"):
-                html.B("{{ warning.subject || 'warning' }}")
-                html.Div("{{ warning.text }}")
-                html.Div("code: {{ warning.code }}", v_if="warning.code", classes="lf-note")
-                controls.button("Show the images", (self.show, "[warning.subject || warning.text]"))
+            with html.Template(v_for="stage in p_stages", key="stage.name"):
+                self._bar("stage", "lf-stage")
+                with html.Template(v_for="one in stage.pairs", key="one.name"):
+                    self._bar("one", "lf-stage lf-one")
+            with html.Div(v_for="(warning, number) in p_warnings", key="number", classes="lf-card", role="alert"):
+                html.B("{{ warning.what }}")
+                html.Div("{{ warning.remedy }}")
+                with html.Div(classes="lf-buttons"):
+                    controls.button(
+                        "See it in the image", "i_place = {...warning.place}; tab = 'images'", "mdi-image-search",
+                        v_if="warning.place", classes="lf-see",
+                    )  # fmt: skip
+                    html.A("{{ warning.code || 'troubleshooting' }}", href=("warning.link",), target="_blank")
             with html.Details(v_if="p_log", open=True):
                 html.Summary("log")
                 html.Pre("{{ p_log }}", classes="lf-diff", id="p-log")
+
+    def _bar(self, name: str, classes: str) -> None:
+        """Show the bar of a stage or of a pair."""
+        with html.Div(classes=classes):
+            html.Span(f"{{{{ {name}.name }}}}")
+            v3.VProgressLinear(
+                model_value=(f"{name}.percent",),
+                height=8,
+                rounded=True,
+                color="primary",
+                raw_attrs=[f':aria-label="{name}.name"'],
+            )
+            html.Span(f"{{{{ {name}.percent }}}} % {{{{ {name}.left }}}}", classes="lf-note")

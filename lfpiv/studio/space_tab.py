@@ -12,6 +12,7 @@ import trame_client.widgets.html as html
 from lfpiv.experiment.images import read_header
 from lfpiv.studio import controls, rig_space
 from lfpiv.studio.draft import location_of
+from lfpiv.studio.form_tab import WRITE
 from lfpiv.studio.look import BACKGROUND, INK
 from lfpiv.studio.session import Session
 
@@ -226,6 +227,13 @@ class Space:
                     controls.button("Add a wall", (guarded(self.add), "['half_space']"), id="s-wall")
                     controls.button("Add a box", (guarded(self.add), "['box']"), id="s-box")
                     controls.button("Remove", guarded(self.remove), v_if="s_drag.startsWith('volume.solid.')")
+                parts = "new RegExp(`^${s_drag}.(centre_mm|size_mm|point_mm|normal)$`)"
+                with html.Div(v_for=f"key in Object.keys(x_texts).filter((key) => {parts}.test(key))", key="key"):
+                    html.Label("{{ key }}", raw_attrs=[":for=\"'s-' + key\""], classes="lf-note")
+                    html.Input(
+                        raw_attrs=[":id=\"'s-' + key\"", ':value="x_texts[key]"'], classes="lf-typed",
+                        change=WRITE.replace("row.id", "key"),
+                    )  # fmt: skip
                 html.Div("{{ fact }}", v_for="fact in s_facts", key="fact", classes="lf-note")
                 html.Div("Numbers go to the tab Experiment, which saves them. Cameras are drawn where the file states "
                          "them; distances beyond the volume are shortened.", classes="lf-note")  # fmt: skip
@@ -234,5 +242,5 @@ class Space:
                     for name in ("volume", "rig", "x", "y", "z"):
                         text = f"along {name}" if len(name) == 1 else name
                         controls.button(text, (guarded(self.look_along), f"['{name}']"), id=f"s-look-{name}")
-            with html.Div(classes="lf-main"), html.Div(classes="lf-view", id="s-view"):
-                self.view = controls.picture(self.plotter, "space")
+            with html.Div(classes="lf-main", id="s-view"):
+                (self.view,) = controls.linked([self.plotter], "space", {"": "true"}, lambda: False)

@@ -1,6 +1,7 @@
 """Trust: the studio opens nothing outside its folders, and runs are started once and stopped as by Ctrl-C."""
 
 import asyncio
+import json
 import logging
 import os
 import signal
@@ -102,6 +103,35 @@ def test_stages_tell_the_time_left(tmp_path):
     weights, pairs = run_process.stages(tmp_path)
     assert weights["percent"] == 100 and pairs["percent"] == 25 and pairs["left"] == "about 2 min left"
     assert run_process.time_left(tmp_path) == "about 2 min left, report included"
+
+
+def test_each_pair_has_a_bar_beside_its_stage(tmp_path):
+    from lfpiv.studio import run_process
+
+    lines = [
+        {"step": "image pairs", "fraction": 0.0, "at": 10.0},
+        {"step": "pair 0", "fraction": 0.0, "at": 10.0, "pair": 0},
+        {"step": "pair 0", "fraction": 1.0, "at": 40.0, "pair": 0},
+        {"step": "pair 1", "fraction": 0.0, "at": 40.0, "pair": 1},
+        {"step": "pair 1", "fraction": 0.5, "at": 240.0, "pair": 1},
+    ]
+    (tmp_path / ".run.jsonl").write_text("\n".join(map(json.dumps, lines)), "utf-8")
+    (stage,) = run_process.stages(tmp_path)
+    assert [(one["name"], one["percent"]) for one in stage["pairs"]] == [("pair 0", 100), ("pair 1", 50)]
+    assert stage["pairs"][1]["left"] == "about 3 min left"
+
+
+def test_a_run_records_each_pair(small_run, tmp_path, monkeypatch):
+    from lfpiv.studio import run_process
+
+    monkeypatch.setenv("LFPIV_PROGRESS_FILE", str(tmp_path / ".run.jsonl"))
+    experiment = small_run.images(tmp_path / "rig")
+    results = small_run.results(experiment.parent / "results")
+    removed = sorted((results / "vectors").glob("pair_*.nc"))[0]
+    removed.unlink()
+    assert commands.call(["run", str(experiment), "--out", str(results), "--quiet"]) == 0
+    (stage,) = [stage for stage in run_process.stages(tmp_path) if stage["name"] in run_process.PAIR_STEPS]
+    assert [(one["name"], one["percent"]) for one in stage["pairs"]] == [("pair 0", 100)]
 
 
 def test_progress_is_recorded_where_the_environment_asks(tmp_path, monkeypatch, tiny_experiment):

@@ -13,6 +13,20 @@ FIRST_S, RUN_S = 60, 120
 """Longest time until images are decoded, and until a run has begun or ended [s]."""
 SETTLED_S = 0.5
 """Time until a view has turned [s]."""
+FOCUSED = """
+return [...document.querySelectorAll(`#${arguments[0]} :is(input, button, select, textarea, a[href], [tabindex="0"])`)]
+  .filter((part) => part.offsetParent && part.tabIndex >= 0 && !part.disabled).map((part) => {
+    part.focus({focusVisible: true});
+    const named = part.labels?.[0]?.textContent || part.ariaLabel || part.textContent.trim() || part.title;
+    const by = document.getElementById(part.getAttribute('aria-labelledby'))?.textContent;
+    const ring = part.closest('.v-field, .v-selection-control') || part;
+    return {
+      tag: part.outerHTML.slice(0, 90), name: (named || by || part.closest('[role=group]')?.ariaLabel || '').trim(),
+      outlined: document.activeElement === part && getComputedStyle(ring).outlineStyle === 'solid',
+    };
+  });
+"""
+"""Script that moves the focus through a tab, and tells the name of each part and whether the focus is seen."""
 PLACES = [(dx, dy) for dx in (60, 120, -60, 0, -120) for dy in (150, 190, 110, 230)]
 """Places beside the middle of the view where a handle may be taken [pixel]."""
 
@@ -90,6 +104,58 @@ def test_a_wall_is_dragged_and_its_numbers_reach_the_form(page):
     assert f"+point_mm = {page.get('x_texts')[point]}" in page.get("x_diff")
     page.browser.execute_script("arguments[0].click()", page.find("x-undo"))
     until(lambda: point not in page.get("x_texts"))
+
+
+def test_what_is_dragged_has_its_numbers_beside_it(page):
+    page.open("space")
+    page.browser.execute_script("trame.state.set('s_drag', 'volume')")
+    field = until(
+        lambda: page.find("s-volume.size_mm") if page.browser.find_elements("id", "s-volume.size_mm") else None
+    )
+    before = page.get("x_texts")["volume.size_mm"]
+    field.send_keys(Keys.CONTROL + "a")
+    field.send_keys("[0.5, 0.4, 0.3]" + Keys.ENTER)
+    until(lambda: "+size_mm = [0.5, 0.4, 0.3]" in page.get("x_diff"))
+    until(lambda: any("0.5 x 0.4 x 0.3 mm" in fact for fact in page.get("s_facts")))
+    page.browser.execute_script("arguments[0].click()", page.find("x-undo"))
+    until(lambda: page.get("x_texts")["volume.size_mm"] == before)
+
+
+def test_sliders_have_names_and_move_by_keys(page):
+    page.open("results")
+    thumb = page.find("s-r_lines")
+    assert thumb.accessible_name == "streamlines" and thumb.aria_role == "slider"
+    thumb.send_keys(Keys.ARROW_RIGHT)
+    until(lambda: page.get("r_lines") == 5)
+    thumb.send_keys(Keys.HOME)
+    until(lambda: page.get("r_lines") == 0)
+
+
+@pytest.mark.parametrize("tab", ["images", "experiment", "space", "preview", "runs", "results"])
+def test_all_that_takes_the_focus_has_a_name_and_shows_it(page, tab):
+    page.open(tab)
+    found = page.browser.execute_script(FOCUSED, f"tab-{tab}")
+    assert len(found) > 4
+    assert [item for item in found if not item["name"] or not item["outlined"]] == []
+
+
+def test_a_warning_opens_the_image_in_which_it_is_seen(page):
+    from lfpiv.studio import warning_cards
+
+    text = "right, frame b, pair 0: rows 40 to 90, columns 20 to 60 show no particles where left would have them"
+    figures = {"top": 40, "bottom": 90, "left": 20, "right": 60, "others": "left"}
+    record = {"code": "dark_part", "subject": "right, frame b", "figures": figures, "pairs": [0], "text": text}
+    page.browser.execute_script(
+        "trame.state.set('p_warnings', arguments[0])", [warning_cards.card(record, ["left", "right"])]
+    )
+    page.open("runs")
+    until(lambda: page.browser.find_elements("css selector", ".lf-see"))
+    link = page.browser.find_element("css selector", "#tab-runs .lf-card a").get_property("href")
+    page.browser.find_element("css selector", ".lf-see").send_keys(Keys.ENTER)
+    until(lambda: page.get("tab") == "images" and page.get("i_name") == "pair 0, frame b", FIRST_S)
+    until(lambda: page.get("i_camera") == "right" and len(page.get("i_region")) == 4)
+    words = page.browser.execute_async_script("fetch(arguments[0]).then((a) => a.text()).then(arguments[1])", link)
+    assert 'id="dark_part"' in words and link.endswith("#dark_part")
 
 
 def test_a_mistake_is_told_as_one_types_and_the_keyboard_saves(page):

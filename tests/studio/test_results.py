@@ -1,5 +1,6 @@
 """Results on the page: a first picture, planes, surfaces, and the script that draws what is seen."""
 
+import shutil
 import subprocess
 import sys
 import urllib.error
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from selenium.webdriver.common.keys import Keys
 from support.report_run import field
 from support.studio_page import served, until
 
@@ -74,6 +76,73 @@ def test_the_script_draws_what_is_seen(results, tmp_path):
         assert image.std() > 10 and np.abs(again.astype(int) - image[..., :3]).mean() < SAME_PICTURE
 
 
+def test_fewer_arrows_and_shorter_lines_are_drawn_while_something_moves(results):
+    import lfpiv
+    from lfpiv.studio import layers, look
+
+    grid = layers.grid_of(layers.field_at(lfpiv.open_results(results), "0"))
+    assert layers.arrows(grid, 1, 1.5, "u", moving=True).n_points <= layers.arrows(grid, 1, 1.5, "u").n_points
+    picture, seen = look.Picture.empty((80, 60)), look.Look(lines=60)
+    drawn = []
+    for moving in (True, True, False, True):
+        picture.show(grid, seen, {}, "", moving)
+        drawn.append(picture.plotter.actors["lines"].mapper.dataset)
+    assert drawn[0] is drawn[1] and drawn[2] is drawn[3]  # what is at rest stays where nothing else is asked for
+    assert 0 < drawn[0].n_points < drawn[2].n_points
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """Return results whose first file is no file of lfpiv, whose third has a wrong byte, and whose last is foreign."""
+    folder = tmp_path / "vectors"
+    for pair in range(5):
+        vectors = field(pair) if pair < 4 else field(pair).assign_attrs(dt_s=3.0)
+        netcdf.write_vectors(vectors, folder / f"pair_{pair:04d}.nc", attributes={"pair": pair})
+    (folder / "pair_0000.nc").write_bytes(b"no vectors")
+    third = folder / "pair_0002.nc"
+    content = bytearray(third.read_bytes())
+    content[len(content) // 2] ^= 255
+    third.write_bytes(content)
+    return tmp_path
+
+
+def test_a_bad_file_is_left_out_by_name(damaged):
+    from lfpiv.results.reader import open_readable
+
+    found, left_out = open_readable(damaged)
+    assert found.pair.values.tolist() == [1, 3] and found["u"].notnull().any()
+    assert {path.name: why.partition(", found ")[2][:9] for path, why in left_out.items()} == {
+        "pair_0000.nc": "a damaged", "pair_0002.nc": "a damaged", "pair_0004.nc": "dt_s = 3.",
+    }  # fmt: skip
+
+
+@pytest.mark.browser
+def test_bad_files_have_cards_and_the_others_are_shown(damaged, browser):
+    with served(damaged) as address:
+        browser.get(address)
+        shown = f"const i = document.querySelector('{VIEW}'); return !!i && i.naturalWidth > 50"
+        until(lambda: browser.execute_script(shown))
+        cards = [card.text for card in browser.find_elements("css selector", "#tab-results .lf-left")]
+        assert [text.partition(" ")[0] for text in cards] == ["pair_0000.nc", "pair_0002.nc", "pair_0004.nc"]
+
+
+@pytest.mark.browser
+def test_a_file_that_is_damaged_behind_its_head_is_left_out_of_the_mean(results, tmp_path, browser):
+    folder = tmp_path / "run"
+    shutil.copytree(results / "vectors", folder / "vectors")
+    shutil.copy(folder / "vectors" / "pair_0001.nc", folder / "vectors" / "pair_0002.nc")
+    bad = folder / "vectors" / "pair_0001.nc"
+    content = bytearray(bad.read_bytes())
+    content[len(content) // 2] ^= 255
+    bad.write_bytes(content)
+    with served(folder) as address:
+        browser.get(address)
+        until(lambda: browser.execute_script("return !!(window.trame && trame.state && trame.state.get('r_moments'))"))
+        browser.execute_script("trame.state.set('r_moment', 'mean')")
+        until(lambda: "pair_0001.nc" in browser.page_source)
+        assert not browser.execute_script("return trame.state.get('message')")
+
+
 @pytest.mark.browser
 def test_the_page_shows_and_turns_results(results, browser):
     with served(results) as address:
@@ -86,7 +155,9 @@ def test_the_page_shows_and_turns_results(results, browser):
         browser.find_element("id", "r-on-x").send_keys(" ")
         second = until(lambda: (now := browser.execute_script(shown)) != first and now)
         browser.find_element("id", "r-turn-left").click()
-        until(lambda: browser.execute_script(shown) != second)
+        third = until(lambda: (now := browser.execute_script(shown)) != second and now)
+        browser.find_element("css selector", "#tab-results .lf-view [tabindex]").send_keys(Keys.ARROW_UP)
+        until(lambda: browser.execute_script(shown) != third)
         browser.find_element("id", "r-copy").click()
         script = until(lambda: "".join(one.get_property("value") for one in browser.find_elements("id", "r-script")))
         assert "slices=(" in script and "camera_position" in script

@@ -3,7 +3,7 @@
   const { h, ref, watch, onMounted, onBeforeUnmount } = Vue;
 
   const LfImage = {
-    props: { image: Object, low: Number, high: Number, marks: Array, colours: String, name: String, smooth: Boolean },
+    props: { image: Object, low: Number, high: Number, marks: Array, colours: String, name: String, smooth: Boolean, region: Array },
     emits: ['point', 'pick'],
     setup(props, { emit }) {
       const box = ref(null), canvas = ref(null), readout = ref('');
@@ -19,6 +19,7 @@
         if (!data || data.rows !== wanted.rows || data.columns !== wanted.columns) view = null;
         data = { ...wanted, values };
         paint();
+        look(props.region);
       }
 
       function paint() {
@@ -40,6 +41,14 @@
         view = { scale, x: (width - data.columns * scale) / 2, y: (height - data.rows * scale) / 2 };
       }
 
+      function look(region) {  // at left, top, right and bottom, with as much around it
+        if (!data || !region || !region.length) return;
+        const [left, top, right, bottom] = region, { width, height } = canvas.value;
+        const scale = Math.min(width / (right - left + 20), height / (bottom - top + 20)) / 2;
+        view = { scale, x: width / 2 - scale * (left + right) / 2, y: height / 2 - scale * (top + bottom) / 2 };
+        draw();
+      }
+
       function draw() {
         const sheet = canvas.value, frame = box.value;
         if (!sheet || !frame) return;
@@ -54,6 +63,11 @@
         context.imageSmoothingEnabled = !!props.smooth || view.scale < 1;
         context.drawImage(bitmap, view.x, view.y, data.columns * view.scale, data.rows * view.scale);
         for (const mark of props.marks || []) drawMark(context, mark);
+        if (props.region && props.region.length) {
+          const [x, y] = at(props.region[0] - 0.5, props.region[1] - 0.5), [u, v] = at(props.region[2] + 0.5, props.region[3] + 0.5);
+          Object.assign(context, { lineWidth: 2, strokeStyle: '#ff922b' });
+          context.strokeRect(x, y, u - x, v - y);
+        }
         sheet.dataset.drawn = Number(sheet.dataset.drawn || 0) + 1;
       }
 
@@ -146,6 +160,7 @@
       watch(() => props.image && props.image.url, load);
       watch(() => [props.low, props.high], paint);
       watch(() => props.marks, draw);
+      watch(() => props.region, look);
       return () => h('div', { ref: box, class: 'lf-image' }, [
         h('canvas', {
           ref: canvas, tabindex: 0, role: 'img', 'aria-label': props.name,
