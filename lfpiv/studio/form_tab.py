@@ -35,17 +35,13 @@ class Form:
                 "x_changed": False,
             }
         )
-        self.state.change("x_open")(lambda x_open, **_: x_open and session.guarded(self._choose)(x_open))
+        self.state.change("x_open")(
+            lambda x_open, **_: x_open and session.guarded(session.choose)("experiment", x_open)
+        )
         self.plain: set[str] = set()
         session.server.trigger("x_write")(session.guarded(self.write))
         session.listeners.append(self._changed)
         self._page()
-
-    def _choose(self, path: str) -> None:
-        found = self.session.places.within(path)
-        if found != self.session.experiment:
-            self.session.experiment = found
-            self.session.changed("experiment")
 
     def _changed(self, what: str) -> None:
         """Read the file again after another one was opened; show it again after another tab changed the draft."""

@@ -61,17 +61,11 @@ class Results:
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
         self.state.change("r_playing")(lambda **_: session.start(self._play()))
-        self.state.change("r_open")(lambda r_open, **_: r_open and session.guarded(self._choose)(r_open))
+        self.state.change("r_open")(lambda r_open, **_: r_open and session.guarded(session.choose)("results", r_open))
         self.files = Files(self)
         session.listeners.append(self._opened)
         session.server.controller.on_client_connected.add(lambda **_: self.request())  # the chart, after the picture
         self._panel()
-
-    def _choose(self, path: str) -> None:
-        found = self.session.places.within(path)
-        if found != self.session.results:
-            self.session.results = found
-            self.session.changed("results")
 
     def _opened(self, what: str) -> None:
         """Open other results."""

@@ -167,7 +167,7 @@ class Runs:
                         "See it in the image", "i_place = {...warning.place}; tab = 'images'", "mdi-image-search",
                         v_if="warning.place", classes="lf-see",
                     )  # fmt: skip
-                    html.A("{{ warning.code || 'troubleshooting' }}", href=("warning.link",), target="_blank")
+                    html.A("More on {{ warning.code || 'warnings' }}", href=("warning.link",), target="_blank")
             with html.Details(v_if="p_log", open=True):
                 html.Summary("log")
                 html.Pre("{{ p_log }}", classes="lf-diff", id="p-log")

@@ -48,6 +48,13 @@ class Session:
         """The state that page and server share."""
         return self.server.state
 
+    def choose(self, what: str, path: str) -> None:
+        """Open another "experiment" or other "results"."""
+        found = self.places.within(path)
+        if found != getattr(self, what):
+            setattr(self, what, found)
+            self.changed(what)
+
     def changed(self, what: str) -> None:
         """Tell all tabs that the experiment or the results changed."""
         self.state.experiment_name = self.places.name(self.experiment) if self.experiment else ""
