@@ -7,8 +7,8 @@ by more than their uncertainty, the vector of their own correlation stays.
 The curvature of the misfit is no measure of the error of the fit, since the light was fitted to the same images. The
 uncertainty of the frames by themselves is independent of the fit, which more than halves it. Errors that both frames
 share show between the cameras only: these ask for unlike light. In simulated pairs twice the standard deviation stated
-holds 84 to 100 % of the errors of a component, 96 % on average, and 88 % where a wall fills half of the volume
-(docs/notebook/joint.md).
+holds 90 to 100 % of the errors of a component, and 73 to 92 % in turbulence whose eddies are hardly larger than the
+windows (docs/notebook/joint.md).
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 CONTRADICTION = 8.0
 """Displacement that is left between the frames by themselves, over the median of its standard deviation, above which
 they contradict. Ghosts leave some, up to 6 in sound pairs."""
-ALONE_SHARE, LEFT_SHARE, LOSSY = 0.39, 0.36, 1.64
+ALONE_SHARE, LEFT_SHARE, LOSSY = 0.43, 0.39, 1.64
 """Standard deviation of a fitted vector: parts that the uncertainty of the frames by themselves and the displacement
 that is left between them add in squares, and the factor of both where particles are lost between the frames."""
-UNLIKE_SHARE = 2.7
+UNLIKE_SHARE = 4.7
 """Part of the uncertainty of the frames by themselves that is added in squares, times how much the cameras ask for
 unlike light."""
 EDGE_VOXEL = 1

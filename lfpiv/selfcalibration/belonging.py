@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from lfpiv.reconstruction.settings import PLAIN, SmartSettings
+from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.selfcalibration.mistakes import (
     IN_TIME,
@@ -28,8 +29,8 @@ from lfpiv.selfcalibration.mistakes import (
 )
 from lfpiv.weights.operator import Weights
 
-ITERATIONS = 8
-"""SMART iterations of a set of images."""
+ITERATIONS = 4
+"""SMART iterations of a set of images: two over ordered subsets, two over all rays."""
 PART_LENSES = 3.0
 """Edge of the parts of a sensor [microlens pitch]: the light of a particle hardly reaches farther."""
 TURN_LENSES = 3
@@ -52,7 +53,8 @@ class ImageFit:
 
     def __init__(self, weights: Weights):
         self.weights = weights
-        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **PLAIN))
+        settings = SmartSettings(iterations=ITERATIONS, intensity_cap=0.0, sieve_voxel=0.0, tolerance=0.0)
+        self._solver = SmartSolver(weights, settings)
         self._parts = {name: self._parts_of(name) for name in weights.cameras}
         self.camera_of_part = np.concatenate([np.full(parts[2], name) for name, parts in self._parts.items()])
         """Camera of each part that `unexplained` returns."""
@@ -290,7 +292,7 @@ def judge(
     found = trials.judged(likely, 1)
     if not thorough and (settled := trials.settled(found, single_images=bool(images))) is not None:
         return settled
-    found = trials.judged([*likely, *trials.chance, *other_mistakes(cameras, near, images)], 2)
+    found = trials.judged([*likely, *trials.chance, *other_mistakes(cameras, near, images)], trials.frames)
     likeliest = found.tried[0]
     if found.margin(likeliest) > -SURE:
         return found
@@ -310,6 +312,13 @@ class _Trials:
         of_other_pairs = [Mistake(kind, (name,), number) for number in late for name, kind in kinds.items()]
         self.chance = of_other_pairs or [Mistake(Kind.CHANCE, (name,)) for name in cameras]
         """What replaces an image by one of other particles."""
+
+    @cached_property
+    def frames(self) -> int:
+        """Number of frames to try: of two that are copies of each other, the second one tells nothing."""
+        first, second = (self._shown(self._pair, frame) or {} for frame in (0, 1))
+        copied = first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
+        return 1 if copied else 2
 
     def judged(self, mistakes: Iterable[Mistake], count: int) -> Judgement:
         """Try mistakes with the first `count` frames; return the judgement by all trials so far."""
@@ -331,13 +340,13 @@ class _Trials:
             return found
         if found.in_order:
             beside = [one for one in self.chance if one.late == self.chance[0].late or not one.late]
-            found = self.judged([RIGHT, *beside[:2]], 2)  # no other pair has this second frame
+            found = self.judged([RIGHT, *beside[:2]], self.frames)  # no other pair has this second frame
             return found if found.fits else None
         if not found.fits:
             return None
         order = [one for one in self._left if one.kind is Kind.FRAMES]
-        found = self.judged([RIGHT, *order], 2)
-        each = [[self._left[one][at : at + 1] for one in (RIGHT, *order)] for at in (0, 1)]
+        found = self.judged([RIGHT, *order], self.frames)
+        each = [[self._left[one][at : at + 1] for one in (RIGHT, *order)] for at in range(self.frames)]
         least = min(advantage(right, exchanged) for right, *others in each for exchanged in others)
         return found if found.fits and least > -SURE else None
 
