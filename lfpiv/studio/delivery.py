@@ -35,8 +35,7 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
     turning = options["view"] in part.views_in_animations
     moving = turning or getattr(window, "lfpiv_moving", False)
     reply = {"stale": False, "mtime": 1, "size": [columns, rows], "global_id": options["view"], "image": None}
-    hidden = min(columns, rows) <= LEAST_PX
-    if hidden or (turning and getattr(window, "lfpiv_drawn", None) == (_changed(window), columns, rows)):
+    if turning and getattr(window, "lfpiv_drawn", None) == (_changed(window), columns, rows):
         return reply
     if tuple(window.GetSize()) != (columns, rows):
         window.SetSize(columns, rows)
