@@ -190,9 +190,9 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
 
 
 def _without_surface(measured: Measured) -> BoardDots:
-    """Return labels as the thin lens in air would have them, less what the surface of a liquid bends.
+    """Return labels less what the surface of a liquid bends, as the thin lens in air would have them.
 
-    Otherwise few planes would be tilted by what the surface does.
+    With few planes, the fit of the board would take this bend for a tilt of planes.
     """
     dots, lens, surface = measured.dots, measured.lens, measured.surface
     if surface is None:

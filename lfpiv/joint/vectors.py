@@ -7,8 +7,8 @@ by more than their uncertainty, the vector of their own correlation stays.
 The curvature of the misfit is no measure of the error of the fit, since the light was fitted to the same images. The
 uncertainty of the frames by themselves is independent of the fit, which more than halves it. Errors that both frames
 share show between the cameras only: these ask for unlike light. In simulated pairs twice the standard deviation stated
-holds 90 to 100 % of the errors of a component, and 73 to 92 % in turbulence whose eddies are hardly larger than the
-windows (docs/notebook/joint.md).
+holds 90 to 100 % of the errors of a component, and as little as 73 % in turbulence whose eddies are hardly larger than
+the windows (docs/notebook/joint.md).
 """
 
 from __future__ import annotations

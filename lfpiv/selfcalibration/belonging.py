@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lfpiv.reconstruction.settings import SmartSettings
+from lfpiv.reconstruction.settings import AUTO, PLAIN, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
 from lfpiv.selfcalibration.mistakes import (
     IN_TIME,
@@ -53,8 +53,7 @@ class ImageFit:
 
     def __init__(self, weights: Weights):
         self.weights = weights
-        settings = SmartSettings(iterations=ITERATIONS, intensity_cap=0.0, sieve_voxel=0.0, tolerance=0.0)
-        self._solver = SmartSolver(weights, settings)
+        self._solver = SmartSolver(weights, SmartSettings(iterations=ITERATIONS, **PLAIN | {"subsets": AUTO}))
         self._parts = {name: self._parts_of(name) for name in weights.cameras}
         self.camera_of_part = np.concatenate([np.full(parts[2], name) for name, parts in self._parts.items()])
         """Camera of each part that `unexplained` returns."""
@@ -315,7 +314,7 @@ class _Trials:
 
     @cached_property
     def frames(self) -> int:
-        """Number of frames to try: of two that are copies of each other, the second one tells nothing."""
+        """Number of frames to try: one if both are copies of each other, since the second one tells nothing."""
         first, second = (self._shown(self._pair, frame) or {} for frame in (0, 1))
         copied = first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
         return 1 if copied else 2
