@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from lfpiv.errors import InputError, printable
+from lfpiv.records import RecordError, open_regular
 
 HOSTS = ("127.0.0.1", "localhost")
 """Names by which a browser of this machine asks."""
@@ -20,6 +21,8 @@ DEEPEST = 3
 """Levels of folders below a given one that are searched for experiments and results."""
 MOST_FOLDERS = 5000
 """Largest number of folders that are searched."""
+MOST_BYTES = 200_000
+"""Size of the start of a file in which the tables of an experiment are looked for."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -99,8 +102,9 @@ class Places:
         for folder in self.folders():
             for path in sorted(folder.glob("*.toml"))[:50]:
                 try:
-                    text = path.read_text("utf-8", errors="replace")[:200_000]
-                except OSError:
+                    with open_regular(path) as file:
+                        text = file.read(MOST_BYTES).decode("utf-8", errors="replace")
+                except (OSError, RecordError):
                     continue
                 if "[[camera]]" in text and "[volume]" in text and "white_image" in text:
                     found.append(path)

@@ -8,11 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 
 import pytest
 
 from lfpiv.cli import commands
 from lfpiv.errors import InputError
+
+LARGE_BYTES = 256 << 20
+"""Size of a file that is no experiment; the start that is read takes less than a hundredth of it."""
 
 
 def test_places_outside_the_folders_are_refused(tmp_path):
@@ -27,6 +31,23 @@ def test_places_outside_the_folders_are_refused(tmp_path):
     for wrong in ("..", str(outside), "link/results", "/etc/passwd", "a/../../outside"):
         with pytest.raises(InputError, match="expected a place in"):
             places.within(wrong)
+
+
+def test_a_large_file_a_pipe_and_a_device_beside_the_results_are_no_obstacle(tmp_path):
+    from lfpiv.studio.access import Places
+
+    os.mkfifo(tmp_path / "pipe.toml")
+    (tmp_path / "device.toml").symlink_to("/dev/zero")
+    with (tmp_path / "large.toml").open("w") as file:
+        file.write("[[camera]]\nwhite_image = 1\n[volume]\n")
+        file.truncate(LARGE_BYTES)
+    tracemalloc.start()
+    try:
+        found = Places((tmp_path,)).experiments()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found == [tmp_path / "large.toml"] and peak < LARGE_BYTES / 16, peak
 
 
 def test_a_page_that_closes_while_pictures_come_logs_nothing(caplog):
