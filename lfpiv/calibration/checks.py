@@ -37,6 +37,7 @@ from lfpiv.lightfield.image_checks import (
 )
 from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
+from lfpiv.lightfield.tone_curve import CURVED, tone_exponent
 from lfpiv.warn import SENTENCES, Code, Warning, warn
 from lfpiv.warn.sentences import OTHER_LIGHT, SHIFTED_LIGHT
 
@@ -84,7 +85,7 @@ FEWEST_PLANES = 2
 
 
 def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, decoder: LightFieldDecoder) -> None:
-    """Compare distance and diameter of the microimages with the stated optics, and warn of saturation.
+    """Compare distance and diameter of the microimages with the stated optics, and warn of saturation and a tone curve.
 
     No other check finds a stated aperture that is larger than the true one.
 
@@ -113,6 +114,12 @@ def check_white(setup: CameraSetup, white: np.ndarray, dark: np.ndarray | None, 
     share = saturated_share(white, white_level(setup.white_path, setup), piles=noisy)
     if share > SATURATED:
         warn(log, Warning(code=Code.WHITE_SATURATED, subject=setup.name, figures={"share": share}))
+    _check_tones(f"{setup.name}, white image", white)
+
+
+def _check_tones(subject: str, image: np.ndarray) -> None:
+    if (exponent := tone_exponent(image)) > CURVED:
+        warn(log, Warning(code=Code.TONE_CURVE, subject=subject, figures={"exponent": exponent}))
 
 
 def _check_pitch(setup: CameraSetup, ratio: float) -> None:
@@ -209,7 +216,7 @@ def check_light(
     images: Sequence[np.ndarray],
     dark: np.ndarray | None,
 ) -> None:
-    """Refuse board images that are copies or that belong to another white image. Warn of saturated images."""
+    """Refuse board images that are copies or that belong to another white image. Warn of saturation and tone curves."""
     paths = [experiment.board_path(setup.name, plane) for plane in range(len(images))]
     first: dict[bytes, int] = {}
     saturated = np.zeros(len(images))
@@ -226,6 +233,7 @@ def check_light(
         figures = {"share": float(saturated[worst]), "path": str(paths[worst])}
         warn(log, Warning(code=Code.BOARD_SATURATED, subject=setup.name, figures=figures))
     plane = len(images) // 2
+    _check_tones(f"{setup.name}, plane {plane}", images[plane])
     image = images[plane] if dark is None else images[plane] - dark
     light = gap_light(image, decoder)
     shift = disagreement(image - np.float32(decoder.background(image)[0]), decoder, misplaced=light > NO_PLACE)

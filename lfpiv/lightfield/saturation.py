@@ -15,6 +15,7 @@ SATURATED = 0.02
 _LEAST_SATURATED = 20  # least number of saturated pixels
 _WIDTHS = (0.0, 0.005)  # width of a pile over its level: one value, or values spread by a camera's own corrections
 _LEAST_SPREAD = 200  # least number of pixels of a spread pile
+_BELOW = 0.1  # depth below the bright pixels in which a pile is compared, too: half of a white image may be as bright
 _NEIGHBOURS = 3  # values, or intervals, below a pile that it is compared with
 _PILE = 4.0  # pixels of a pile, relative to each of them
 _ABOVE = 0.25  # pixels above a pile, such as hot ones, relative to the pile: at most
@@ -70,7 +71,8 @@ def _pile(image: np.ndarray, width: float) -> float:
     flat = image.ravel()
     sample = flat[:: 1 + flat.size // _SAMPLES]
     median, high = np.percentile(sample, (50, _BRIGHT_PERCENTILE))
-    bright = np.sort(flat[flat > (median + high) / 2])
+    least = (median + high) / 2
+    bright = np.sort(flat[flat > (1 - _BELOW) * least])
     values, first, count = np.unique(bright, return_index=True, return_counts=True)
     above = len(bright) - first - count
     if width:
@@ -81,8 +83,8 @@ def _pile(image: np.ndarray, width: float) -> float:
     else:
         padded = np.concatenate([np.zeros(_NEIGHBOURS, int), count])
         below = np.max([padded[shift : shift + len(count)] for shift in range(_NEIGHBOURS)], axis=0)
-    least = _LEAST_SPREAD if width else _LEAST_SATURATED
-    piles = np.flatnonzero((count >= least) & (count > _PILE * below) & (above <= _ABOVE * count))
+    enough = count >= (_LEAST_SPREAD if width else _LEAST_SATURATED)
+    piles = np.flatnonzero((values >= least) & enough & (count > _PILE * below) & (above <= _ABOVE * count))
     if not piles.size:
         return np.inf
     level = float(values[piles[np.argmax(count[piles])]]) * (1 - width)

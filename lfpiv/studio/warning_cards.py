@@ -67,9 +67,9 @@ def _image(code: str, text: str, record: Mapping[str, Any]) -> str:
         return "white"
     if code.startswith(BOARD):
         return next(iter(re.findall(r"\bplane \d+", text)), "plane 0")
-    frame = re.search(r"\b(frame \w+|instant \d+)\b", str(record.get("subject") or text))
+    frame = re.match(r"[^:]*?, (frame \w+|instant \d+|plane \d+|white)\b", str(record.get("subject") or text))
     pair = next(iter(record.get("pairs") or re.findall(r"\bpairs? (\d+)", text)), None)
-    if frame is not None and frame[1].startswith("instant"):
+    if frame is not None and not frame[1].startswith("frame"):
         return frame[1]
     return "" if pair is None else f"pair {pair}, {frame[1] if frame is not None else 'frame a'}"
 

@@ -43,6 +43,23 @@ def test_light_within_the_range_does_not_pile_up():
     assert saturated_share(np.full((500, 500), 2700.0) * (light() < 500), piles=False) == 0
 
 
+def white_image():
+    """A white image of 12 bits, of which more than half lies within microimages."""
+    rng = np.random.default_rng(3)
+    return np.where(rng.random((500, 500)) < 0.6, rng.normal(2700, 45, (500, 500)), rng.uniform(30, 2700, (500, 500)))
+
+
+@pytest.mark.parametrize("gamma", [1, 1.8, 2.2, 2.6])
+@pytest.mark.parametrize("end", [2900, 3100, 3500, 4095, 5000])
+def test_the_middles_of_microimages_in_8_bits_are_no_pile(gamma, end):
+    """Half of a white image is as bright as the median. A curve moves its levels together."""
+    assert saturated_share((255 * np.clip(white_image() / end, 0, 1) ** (1 / gamma)).round()) == 0
+
+
+def test_a_white_image_that_is_mostly_clipped_is_saturated():
+    assert saturated_share(np.minimum(white_image(), 2600).round()) > 0.5
+
+
 def test_hot_pixels_at_the_end_of_the_range_are_no_saturated_light():
     image = (light() / 4).round()
     image.flat[:: 250_000 // 40] = 4095

@@ -30,6 +30,8 @@ PAIR = "pair 4, frame b"
         (Warning(code=Code.EMPTY, subject="left, instant 5", figures={"structure": 0.1}), "instant 5"),
         (Warning(code=Code.PLANE_EMPTY, subject="left", figures={"plane": 2, "z_mm": 1.0, "path": "b.tif"}), "plane 2"),
         (Warning(code=Code.WHITE_SATURATED, subject="left", figures={"share": 0.1}), "white"),
+        (Warning(code=Code.TONE_CURVE, subject="left, white image", figures={"exponent": 2.2}), "white"),
+        (Warning(code=Code.TONE_CURVE, subject="left, plane 1", figures={"exponent": 2.2}), "plane 1"),
     ],
 )
 def test_a_line_of_the_log_names_the_same_as_the_stored_warning(warning, image):
