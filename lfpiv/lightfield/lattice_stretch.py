@@ -36,7 +36,7 @@ class LatticeStretch:
     likeness: float
     """Correlation of the folds by the stretch that the other half of the tiles shows."""
     unstretched: float
-    """The same without a stretch or shift."""
+    """The same without a stretch or shift, or with the opposite ones, which blur the folds as much, if that is more."""
 
     @property
     def gain(self) -> float:
@@ -90,12 +90,13 @@ def fit_stretch(
     fits = [_Half(light[part], plain[part], order, [shift[part] for shift in shifts]) for part in (half, ~half)]
     found = [fit.best() for fit in fits]
     turn, widen = np.mean([place[:2] for place in found], axis=0)
+    judged = list(zip(fits, found[::-1], strict=True))
     return LatticeStretch(
         edge_pitch=(float(turn), float(widen)),
         turn_deg=float(np.degrees(turn * pitch / half_diagonal)),
         widening=float(widen * pitch / half_diagonal),
-        likeness=float(np.mean([fit.likeness(place) for fit, place in zip(fits, found[::-1], strict=True)])),
-        unstretched=float(np.mean([fit.likeness(np.zeros(4)) for fit in fits])),
+        likeness=float(np.mean([fit.likeness(place) for fit, place in judged])),
+        unstretched=float(np.mean([max(fit.likeness(sign * place) for sign in (0, -1)) for fit, place in judged])),
     )
 
 

@@ -111,6 +111,18 @@ def test_a_turned_or_refocused_array_is_told_by_its_turn_and_pitch(pair_of_camer
     assert abs(float(told[2]) / 100 * (1 if told[3] == "farther" else -1) - widening) < WIDENING
 
 
+@pytest.mark.parametrize("strength", [0.5, 1, 1.5])
+def test_rims_that_a_subtracted_background_leaves_are_no_turned_array(pair_of_cameras, strength):
+    """Any turn blurs a rim to a disc, and so does the opposite turn."""
+    experiment, calibration = pair_of_cameras
+    decoder = calibration.cameras["right"].decoder
+    image = experiment.particle_image("right", 0, "a")
+    light = image - np.float32(decoder.background(image)[0])
+    rim = (decoder.coverage > 0) & (decoder.coverage < 0.3)
+    left = strength * light[decoder.coverage > 0.9].mean() * rim
+    assert lattice_fit.disagreement((light + left).astype(np.float32), decoder) is None
+
+
 def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     experiment, _ = pair_of_cameras
     first, second = (experiment.particle_image("right", 0, frame) for frame in "ab")
