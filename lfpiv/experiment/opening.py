@@ -66,8 +66,11 @@ def open_experiment(path: str | Path) -> Experiment:
 
 def read_experiment(path: str | Path) -> Experiment:
     """Read and check an experiment as `open_experiment` does, without its particle images."""
-    path = Path(path)
-    table = _read_table(path)
+    return experiment_of(Path(path), _read_table(Path(path)))
+
+
+def experiment_of(path: Path, table: ExperimentTable) -> Experiment:
+    """Check the tables of an experiment file, as `read_experiment` does, and return what they state."""
     check_tables(path, table)
     board, particles = table.board, table.particles
     cameras = tuple(_camera(path, camera, table.board.axes) for camera in table.camera)

@@ -32,8 +32,8 @@ def json_schema(model: type[BaseModel]) -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def tables_of(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """Yield a model and all models in its fields."""
+def tables_of(model: Any) -> Iterator[type[BaseModel]]:
+    """Yield a model, or those in an annotation, and all models in its fields."""
     todo: list[Any] = [model]
     seen: list[Any] = []
     while todo:

@@ -13,7 +13,8 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from lfpiv.errors import InputError, printable
-from lfpiv.records import RecordError, open_regular
+from lfpiv.records import RecordError, open_regular, read_object, read_text
+from lfpiv.results.folder import Folder
 
 HOSTS = ("127.0.0.1", "localhost")
 """Names by which a browser of this machine asks."""
@@ -52,10 +53,10 @@ class Token:
                 response = error
             except ConnectionError:  # the page was closed while something was sent to it
                 response = web.Response()
-            if asked and not response.prepared:
-                response.set_cookie(name, self.word, httponly=True, samesite="Strict")
             if not response.prepared:
                 response.headers["Referrer-Policy"] = "no-referrer"
+                if asked:
+                    response.set_cookie(name, self.word, httponly=True, samesite="Strict")
             return response
 
         return guard
@@ -63,33 +64,30 @@ class Token:
 
 @dataclass(frozen=True)
 class Places:
-    """The folders that the studio was given. It opens nothing outside them on behalf of the page."""
+    """The folder that the studio was given. It opens nothing outside on behalf of the page."""
 
-    roots: tuple[Path, ...]
+    root: Path
 
     def within(self, text: str | Path) -> Path:
-        """Return a path if it lies in a given folder, links followed.
+        """Return a path if it lies in the folder, links followed.
 
         Raises
         ------
         InputError
             If it lies outside.
         """
-        path = Path(os.path.expanduser(text))
-        path = (path if path.is_absolute() else self.roots[0] / path).resolve()
-        if not any(path == root or root in path.parents for root in self.roots):
-            listed = ", ".join(map(str, self.roots))
-            raise InputError(f"{path}: expected a place in {listed}. Start `lfpiv studio` with a folder above it.")
+        path = (self.root / os.path.expanduser(text)).resolve()
+        if not path.is_relative_to(self.root):
+            raise InputError(f"{path}: expected a place in {self.root}. Start `lfpiv studio` with a folder above it.")
         return path
 
     def name(self, path: Path) -> str:
-        """Return a path as the page shows it: relative to the first folder where it lies there."""
-        root = self.roots[0]
-        return printable(str(path.relative_to(root)) if path != root and root in path.parents else str(path))
+        """Return a path as the page shows it: relative to the folder where it lies there."""
+        return printable(str(path.relative_to(self.root) if self.root in path.parents else path))
 
     def folders(self) -> Iterator[Path]:
-        """Yield given folders and those below, hidden ones left out, no link followed."""
-        level, left = list(self.roots), MOST_FOLDERS
+        """Yield the folder and those below, hidden ones left out, no link followed."""
+        level, left = [self.root], MOST_FOLDERS
         for _ in range(DEEPEST + 1):
             yield from (level := level[:left])
             left -= len(level)
@@ -111,9 +109,21 @@ class Places:
         return found
 
     def results(self) -> list[Path]:
-        """Return the folders of runs: those with vectors, or a calibration."""
-        return [
-            folder
-            for folder in self.folders()
-            if any((folder / "vectors").glob("*.nc")) or (folder / "calibration.h5").is_file()
-        ]
+        """Return the folders of runs."""
+        return list(filter(is_run, self.folders()))
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder has results of a run: vectors, or a calibration."""
+    return any((folder / "vectors").glob("*.nc")) or Folder(folder).calibration.is_file()
+
+
+def belongs(experiment: Path, results: Path) -> bool:
+    """Return whether results are of an experiment file, by its name in their summary and by their places."""
+    near = experiment.is_relative_to(results) or results.is_relative_to(experiment.parent)
+    try:
+        stated = Path(read_object(read_text(Folder(results).summary))["experiment"]["file"])
+    except (OSError, RecordError, KeyError, TypeError):
+        return near
+    named = len(stated.parts) > 1 and str(experiment).endswith(str(stated))
+    return named or (near and stated.name == experiment.name)

@@ -1,4 +1,4 @@
-"""Small charts as SVG, drawn as the panels of the report are: lines and steps over one axis, in colours of the page."""
+"""What people call the fields of results, and charts of them as SVG, drawn as the panels of the report are."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from lfpiv.report import svg
+
+LABELS = {
+    "speed": ("speed", "m/s"), "u": ("u", "m/s"), "v": ("v", "m/s"), "w": ("w", "m/s"),
+    "vorticity_magnitude": ("vorticity", "1/s"), "vorticity_x": ("vorticity x", "1/s"),
+    "vorticity_y": ("vorticity y", "1/s"), "vorticity_z": ("vorticity z", "1/s"), "q_criterion": ("Q", "1/s²"),
+    "divergence": ("divergence", "1/s"), "pressure": ("pressure", "Pa"), "uncertainty": ("uncertainty", "voxel"),
+    "peak_ratio": ("peak ratio", ""), "correlation": ("correlation", ""), "valid": ("valid", ""),
+}  # fmt: skip
+"""Fields in the order of the lists, what people call them, and their units. Others follow by their names."""
 
 
 def chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], x_title: str, y_title: str) -> str:
@@ -23,3 +32,9 @@ def histogram(values: np.ndarray, bins: int = 60) -> tuple[np.ndarray, np.ndarra
     """Return the corners of the steps of a histogram: x and y."""
     count, edges = np.histogram(values[np.isfinite(values)], bins)
     return np.repeat(edges, 2)[1:-1], np.repeat(count, 2)
+
+
+def title_of(name: str) -> str:
+    """Return what people call a field, with its unit."""
+    text, unit = LABELS.get(name, (name.replace("_", " "), ""))
+    return f"{text} [{unit}]" if unit else text

@@ -11,18 +11,17 @@ from trame.widgets import vuetify3 as v3
 
 DIGITS = 5
 """Digits of a slider's value in the field beside it."""
-TURNS = {
-    "left": (-15.0, 0.0, 1.0), "right": (15.0, 0.0, 1.0), "up": (0.0, 15.0, 1.0), "down": (0.0, -15.0, 1.0),
-    "closer": (0.0, 0.0, 1.2), "farther": (0.0, 0.0, 1 / 1.2),
+KEYS = {
+    "ArrowLeft": (-15.0, 0.0, 1.0), "ArrowRight": (15.0, 0.0, 1.0), "ArrowUp": (0.0, 15.0, 1.0),
+    "ArrowDown": (0.0, -15.0, 1.0), "+": (0.0, 0.0, 1.2), "-": (0.0, 0.0, 1 / 1.2),
 }  # fmt: skip
-"""Name of a step -> angles to the right and up [degree], and zoom."""
-KEYS = dict(zip(("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "+", "-"), TURNS, strict=True))
-"""Key that makes a step of a view."""
+"""Key that turns a view -> angles to the right and up [degree], and zoom."""
 
 
-def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str = "", **more: Any) -> None:
-    """Show a slider of a value of the state, with a field beside it in which the value is typed."""
-    with html.Div(classes="lf-slider", **more):
+def slider(name: str, label: str, low: Any, high: Any, step: Any, first: Any, *, unit: str = "", **more: Any) -> None:
+    """Show a slider of a value of the state, `first` at the start, with a field beside it in which it is typed."""
+    with html.Div(classes="lf-slider", **more) as shown:
+        shown.server.state.setdefault(name, first)
         html.Label(f"{label}{f' [{unit}]' if unit else ''}", raw_attrs=[f'for="s-{name}"'])
         told = f"{name} = Number($event.target.value)"
         html.Input(type="range", min=low, max=high, step=step, value=(name,), id=f"s-{name}", input=told)
@@ -32,31 +31,21 @@ def slider(name: str, label: str, low: Any, high: Any, step: Any, *, unit: str =
         )  # fmt: skip
 
 
-def choice(name: str, label: str, items: Any, **more: Any) -> None:
+def choice(name: str, label: str, items: Any, first: str = "", **more: Any) -> None:
     """Show a list to choose from."""
-    v3.VSelect(
-        v_model=(name,), label=label, items=items, density="compact", hide_details=True, variant="outlined", **more
-    )
+    more |= {"label": label, "items": items, "density": "compact", "hide_details": True, "variant": "outlined"}
+    v3.VSelect(v_model=(name,), **more).server.state.setdefault(name, first)
 
 
-def switch(name: str, label: str, **more: Any) -> None:
+def switch(name: str, label: str, first: bool = False, **more: Any) -> None:
     """Show a box to tick."""
-    v3.VCheckbox(v_model=(name,), label=label, density="compact", hide_details=True, **more)
+    shown = v3.VCheckbox(v_model=(name,), label=label, density="compact", hide_details=True, **more)
+    shown.server.state.setdefault(name, first)
 
 
 def button(label: str, click: Any, icon: str = "", **more: Any) -> None:
     """Show a button."""
-    options = {"prepend_icon": icon} if icon else {}
-    v3.VBtn(label, click=click, size="small", variant="tonal", **options, **more)
-
-
-def turn(camera: Any, name: str) -> None:
-    """Turn a camera by a step."""
-    right, up, closer = TURNS[name]
-    camera.Azimuth(right)
-    camera.Elevation(up)
-    camera.OrthogonalizeViewUp()
-    camera.zoom(closer)
+    v3.VBtn(label, click=click, size="small", variant="tonal", prepend_icon=icon or None, **more)
 
 
 def linked(plotters: Sequence[Any], name: str, titles: Mapping[str, str], also: Any = lambda: True) -> list[Any]:
@@ -71,7 +60,11 @@ def linked(plotters: Sequence[Any], name: str, titles: Mapping[str, str], also: 
             view.update()
 
     def key(pressed: str) -> None:
-        turn(plotters[0].camera, KEYS[pressed])
+        camera, (right, up, closer) = plotters[0].camera, KEYS[pressed]
+        camera.Azimuth(right)
+        camera.Elevation(up)
+        camera.OrthogonalizeViewUp()
+        camera.zoom(closer)
         for plotter, view in zip(plotters, views, strict=True):
             plotter.renderer.ResetCameraClippingRange()
             view.update()

@@ -12,8 +12,8 @@ import cv2
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 
-LEAST_PX = 10
-"""Views of hidden tabs are smaller, and are not drawn."""
+LEAST_PX, HIDDEN_PX = 10, (450, 325)
+"""Views of hidden tabs are smaller, and have this size: what is seen until a busy browser asks again is blurred."""
 MOVING_PX = 400_000
 """Largest number of pixels of a picture while it is turned or a slider moves; at rest the view's own number."""
 QUALITY = {True: 70, False: 95}
@@ -31,7 +31,8 @@ def send_at_once(protocol: Any) -> None:
 def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
     """Return the picture of a view as trame-vtk sends it; none where nothing changed while it is turned."""
     window = part.get_view(options["view"])
-    columns, rows = (max(int(length), LEAST_PX) for length in options.get("size") or window.GetSize())
+    columns, rows = map(int, options.get("size") or window.GetSize())
+    columns, rows = HIDDEN_PX if min(columns, rows) < LEAST_PX else (columns, rows)
     turning = options["view"] in part.views_in_animations
     moving = turning or getattr(window, "lfpiv_moving", False)
     reply = {"stale": False, "mtime": 1, "size": [columns, rows], "global_id": options["view"], "image": None}

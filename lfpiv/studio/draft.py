@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
@@ -17,7 +18,7 @@ from lfpiv.experiment.opening import check_tables
 from lfpiv.experiment.toml import parse, read_text
 from lfpiv.files import write_text
 from lfpiv.settings.experiment import ExperimentTable
-from lfpiv.settings.keys import key_rows, unit_of
+from lfpiv.settings.keys import key_rows, tables_of, unit_of
 from lfpiv.settings.volume import Box, HalfSpace
 
 Location = tuple[int | str, ...]
@@ -44,6 +45,11 @@ class Draft:
     def values(self) -> dict[str, Any]:
         """The values, as plain Python."""
         return self.document.unwrap()
+
+    @property
+    def table(self) -> ExperimentTable:
+        """The values, checked; ValidationError where one is wrong."""
+        return ExperimentTable.model_validate(self.values)
 
     @property
     def text(self) -> str:
@@ -73,26 +79,16 @@ class Draft:
             table = table[part]
         key = location[-1]
         if value is None:
-            if key in table:
-                del table[key]
+            table.pop(key, None)
         else:
-            item, old = tomlkit.item(value), table[key] if key in table else None
-            if old is not None and hasattr(old, "trivia") and hasattr(item, "trivia"):
-                item.trivia.comment_ws, item.trivia.comment = old.trivia.comment_ws, old.trivia.comment
-            table[key] = item
+            table[key] = value
 
     def write(self, location: Sequence[int | str], text: str, plain: bool) -> None:
         """Replace a value by a text that a person typed: TOML, or words without quotes; nothing removes the key."""
-        text = text.strip()
-        if not text:
-            self.set(location, None)
-            return
-        value: Any = text
-        if not plain:
-            try:
-                value = tomlkit.parse(f"value = {text}\n").unwrap()["value"]
-            except Exception:  # not TOML: taken as words, and refused by the settings where they want a number
-                value = text
+        value: Any = text.strip() or None
+        if value and not plain:
+            with contextlib.suppress(Exception):  # words that are no TOML are refused by settings that want a number
+                value = tomlkit.value(value).unwrap()
         self.set(location, value)
 
     def add_solid(self, kind: str, where: dict[str, Any]) -> None:
@@ -116,12 +112,10 @@ class Draft:
         """Return what is wrong at each place, by its dotted name; "" for the file as a whole."""
         values = self.values
         try:
-            table = ExperimentTable.model_validate(values)
+            check_tables(self.path, self.table)
         except ValidationError as error:
             found = problems.explain_each(error, ExperimentTable, values)
             return {".".join(map(str, location)): text for location, text in found.items()}
-        try:
-            check_tables(self.path, table)
         except InputError as error:
             return {"": str(error).removeprefix(f"{self.path}: ")}
         return {}
@@ -148,7 +142,7 @@ class Draft:
         """Return what a form of the file needs: tables, and for each key its range, unit, default and meaning."""
         found = [self._form("", ExperimentTable, "experiment")]
         for name, field in ExperimentTable.model_fields.items():
-            model = _model_of(field.annotation)
+            model = next(tables_of(field.annotation), None)
             if model is None:
                 continue
             if name == "camera":
@@ -187,13 +181,6 @@ class Draft:
 def location_of(name: str) -> Location:
     """Return the place of a dotted name."""
     return tuple(int(part) if part.isdigit() else part for part in name.split(".") if part)
-
-
-def _model_of(annotation: Any) -> type[BaseModel] | None:
-    """Return the model in an annotation of a table or a list of tables; None for a value."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((model for one in get_args(annotation) if (model := _model_of(one)) is not None), None)
 
 
 @functools.cache

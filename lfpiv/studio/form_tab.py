@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import difflib
 from typing import Any
 
@@ -23,18 +24,8 @@ class Form:
 
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
-        self.state.update(dict.fromkeys(("x_diff", "x_open", "x_checked"), ""))
-        self.state.update(
-            {
-                "x_tables": [],
-                "x_texts": {},
-                "x_wrong": {},
-                "x_elsewhere": [],
-                "x_files": [],
-                "x_shown": [0],
-                "x_changed": False,
-            }
-        )
+        self.state.update({"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_elsewhere": [], "x_files": []})
+        self.state.update({"x_shown": [0], "x_changed": False, "x_diff": "", "x_checked": ""})
         self.state.change("x_open")(
             lambda x_open, **_: x_open and session.guarded(session.choose)("experiment", x_open)
         )
@@ -79,18 +70,13 @@ class Form:
 
     def write(self, name: str, text: str) -> None:
         """Take what was typed into a field."""
-        draft = self.session.draft
-        if draft is None:
-            return
-        draft.write(location_of(name), str(text), name in self.plain)
+        self.session.edited.write(location_of(name), str(text), name in self.plain)
         self._show(anew=False)
         self.session.told("typed")
 
     def edit(self, what: str, place: str = "") -> None:
         """Add or remove a camera, a solid or an optional table, undo all, or save."""
-        draft = self.session.draft
-        if draft is None:
-            return
+        draft = self.session.edited
         if what == "camera":
             draft.add_camera()
         elif what == "remove":
@@ -111,7 +97,7 @@ class Form:
         with self.state:
             self.state.x_checked = "saved; checking the images ..."
         try:
-            experiment = await self.session.aside(open_experiment, self.session.experiment)
+            experiment = await asyncio.to_thread(open_experiment, self.session.edited.path)
             text = f"saved; complete: {experiment.pairs} pairs of {len(experiment.cameras)} cameras"
         except ValueError as error:
             text = f"saved; not complete yet: {error}"
@@ -126,6 +112,7 @@ class Form:
                 controls.button("Save", (edit, "['save']"), "mdi-content-save", disabled=("!x_changed",), id="x-save")
                 controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",), id="x-undo")
                 controls.button("Add a camera", (edit, "['camera']"), "mdi-camera-plus")
+            html.Div("No experiment file is open: choose one above.", v_if="!experiment_name", classes="lf-note")
             html.Div("{{ text }}", v_for="text in x_elsewhere", key="text", classes="lf-wrong", role="alert")
             html.Div("{{ x_checked }}", v_if="x_checked", classes="lf-note", role="status")
             with v3.VExpansionPanels(multiple=True, v_model=("x_shown",), variant="accordion"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from trame_client.widgets.core import AbstractElement
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.studio import charts, controls
 from lfpiv.studio.raw_images import MOST_MARKS, RawImages
-from lfpiv.studio.session import Session
+from lfpiv.studio.session import NO_EXPERIMENT, Session, sent
 
 LATTICE, DOT, ARROW, X_AXIS, Y_AXIS = "#37b24d", "#ffd43b", "#ff6b6b", "#ff6b6b", "#4dabf7"
 MARKED = {"saturated": "#ff922b", "hot": "#e64980"}
@@ -32,14 +34,11 @@ class Images:
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
         self.raw: RawImages | None = None
-        self.image: np.ndarray | None = None
         self.state.update(
             {
-                "i_cameras": [], "i_camera": "", "i_names": [], "i_name": "", "i_image": None, "i_low": 0.0,
-                "i_high": 1.0, "i_top": 1.0, "i_marks": [], "i_lattice": True, "i_dots": True, "i_pixels": True,
-                "i_axes": True, "i_facts": [], "i_chart": "", "i_u": 0.0, "i_v": 0.0, "i_radius": 1.0,
-                "i_follow": True, "i_pupil": None, "i_pupil_high": 1.0, "i_z": 0.0, "i_depth": [-1.0, 1.0],
-                "i_plane": None, "i_both": False, "i_busy": "", "i_source": "", "i_place": None, "i_region": [],
+                "i_cameras": [], "i_names": [], "i_image": None, "i_top": 1.0, "i_marks": [], "i_facts": [],
+                "i_chart": "", "i_radius": 1.0, "i_pupil": None, "i_pupil_high": 1.0, "i_depth": [-1.0, 1.0],
+                "i_plane": None, "i_busy": "", "i_source": "", "i_place": None, "i_region": [],
             }
         )  # fmt: skip
         change = self.state.change
@@ -54,28 +53,25 @@ class Images:
 
     def _changed(self, what: str) -> None:
         """Forget what belongs to an experiment or a run that was open before."""
-        if what not in ("experiment", "results", "saved"):
-            return
-        self.raw = None
-        self._open()
+        if what in ("experiment", "results", "saved"):
+            self.raw = None
+            self._open()
 
     def _open(self) -> None:
-        wanted = self.state.tab == "images" and self.session.experiment is not None
-        if wanted and self.raw is None and not self.state.i_busy:
-            self.session.start(self._open_aside())
+        path = self.session.experiment if self.state.tab == "images" else None
+        if path is not None and self.raw is None and not self.state.i_busy:
+            self.session.start(self._open_aside(path))
 
-    async def _open_aside(self) -> None:
+    async def _open_aside(self, path: Path) -> None:
         """Read the experiment beside the page."""
-        session = self.session
-        with session.busy("i_busy", "reading the experiment"):
-            raw = RawImages(await session.aside(read_experiment, session.experiment), session.results)
-        with self.state:
-            self.raw = raw
-            self.state.i_cameras = [setup.name for setup in raw.experiment.cameras]
-            self.state.i_camera = self.state.i_cameras[0]
+        with self.session.busy("i_busy", "reading the experiment"):
+            self.raw = raw = RawImages(await asyncio.to_thread(read_experiment, path), self.session.results)
+        with self.state as s:
+            s.i_cameras = [setup.name for setup in raw.experiment.cameras]
+            s.i_camera = s.i_cameras[0]
             z, grid = float(raw.experiment.grid.centre_mm[2]), raw.experiment.grid
             half = grid.shape[0] * grid.voxel_mm / 2
-            self.state.i_depth, self.state.i_z = [z - half, z + half], z
+            s.i_depth, s.i_z = [z - half, z + half], z
             self._go()
             self._show()
 
@@ -101,35 +97,39 @@ class Images:
 
     async def _show_aside(self, raw: RawImages, camera: str, name: str) -> None:
         """Show an image at once, and what is seen in it as soon as the camera is decoded."""
-        session = self.session
-        image = await session.aside(raw.read, camera, name)
-        with self.state:
-            if (self.state.i_camera, self.state.i_name) != (camera, name):
+        image = await asyncio.to_thread(raw.read, camera, name)
+        with self.state as s:
+            if (s.i_camera, s.i_name) != (camera, name):
                 return
-            self.image = image
-            self.state.i_image = session.offer(raw.recorded(camera, image))
+            s.i_image = sent(raw.recorded(camera, image))
             sample = image[::3, ::3]
-            self.state.i_top = float(image.max())
-            self.state.i_low, self.state.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
-            self.state.i_marks = []
+            s.i_top = float(image.max())
+            s.i_low, s.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
+            s.i_marks = []
             values, counts = charts.histogram(sample)
-            self.state.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
-        with session.busy("i_busy", "finding the microlenses"):
-            await session.aside(raw.calibrated, camera)
-        with self.state:
-            self.state.i_radius = raw.calibrated(camera).optics.pupil_radius_mm
-            self.state.i_source = "measured by the run" if raw.measured else "nominal, not calibrated yet"
-            if (self.state.i_camera, self.state.i_name) == (camera, name):
+            s.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
+        with self.session.busy("i_busy", "finding the microlenses"):
+            found = await asyncio.to_thread(raw.calibrated, camera)
+        with self.state as s:
+            s.i_radius = found.optics.pupil_radius_mm
+            s.i_source = "measured by the run" if raw.measured else "nominal, not calibrated yet"
+            if (s.i_camera, s.i_name) == (camera, name):
                 self._mark()
                 self._pupil()
                 self._refocus()
 
+    @property
+    def decoded(self) -> RawImages | None:
+        """The images, once their cameras are known and an image is chosen."""
+        return self.raw if self.raw is not None and self.raw.cameras and self.state.i_name else None
+
     def _mark(self) -> None:
         """Put lattice, dots, axes and marked pixels over the picture."""
-        raw, image, s = self.raw, self.image, self.state
-        if raw is None or image is None or not raw.cameras:
+        raw, s = self.decoded, self.state
+        if raw is None:
             return
         camera, name = s.i_camera, s.i_name
+        image = raw.read(camera, name)
         marks, facts = [], [f"{image.min():.6g} to {image.max():.6g} counts, mean {image.mean():.5g}"]
         optics = raw.calibrated(camera).optics
         if s.i_lattice:
@@ -156,22 +156,21 @@ class Images:
 
     def follow(self, place: list[float]) -> None:
         """Look through the pupil point that the pixel under the pointer sees."""
-        raw = self.raw
-        if raw is not None and raw.cameras and self.state.i_follow:
+        if (raw := self.decoded) is not None and self.state.i_follow:
             u, v = raw.pupil_at(self.state.i_camera, (place[0], place[1]))
             self.state.i_u, self.state.i_v = float(f"{u:.4g}"), float(f"{v:.4g}")
 
     def _pupil(self) -> None:
-        raw, image, s = self.raw, self.image, self.state
-        if raw is None or image is None or not raw.cameras:
+        raw, s = self.decoded, self.state
+        if raw is None:
             return
-        view = raw.pupil_view(s.i_camera, image, (float(s.i_u), float(s.i_v)))
+        view = raw.pupil_view(s.i_camera, s.i_name, (float(s.i_u), float(s.i_v)))
         s.i_pupil_high = float(np.percentile(view, 99.7)) or 1.0
-        s.i_pupil = self.session.offer(view)
+        s.i_pupil = sent(view)
 
     def _refocus(self) -> None:
-        raw, s = self.raw, self.state
-        if raw is None or self.image is None or not raw.cameras:
+        raw, s = self.decoded, self.state
+        if raw is None:
             return
         names = [camera for camera in s.i_cameras if s.i_name in raw.names(camera)]
         shown = [s.i_camera, *(name for name in names if name != s.i_camera)] if s.i_both else [s.i_camera]
@@ -179,32 +178,37 @@ class Images:
         planes = [plane / (float(np.percentile(plane, 99.7)) or 1.0) for plane in planes]
         if len(planes) == 2:  # red and cyan: what both see is white
             planes = [np.stack([planes[0], planes[1], planes[1]], axis=-1)]
-        s.i_plane = self.session.offer(planes[0])
+        s.i_plane = sent(planes[0])
 
     def _panel(self) -> None:
         with html.Div(classes="lf-split"):
             with html.Div(classes="lf-panel"):
-                html.Div("Open an experiment file to see its images.", v_if="!experiment_name", classes="lf-note")
+                html.Div(
+                    NO_EXPERIMENT,
+                    v_if="!experiment_name",
+                    classes="lf-note",
+                )
                 html.Div("{{ i_busy }} ...", v_if="i_busy", classes="lf-note", role="status")
                 controls.choice("i_camera", "camera", ("i_cameras",), id="i-camera")
                 controls.choice("i_name", "image", ("i_names",), id="i-name")
                 html.H3("Over the picture")
-                controls.switch("i_lattice", "lattice of the microlenses", id="i-lattice")
-                controls.switch("i_dots", "dots of the board, named; residuals x 50")
-                controls.switch("i_axes", "axes x and y of the volume")
-                controls.switch("i_pixels", "saturated and hot pixels")
+                controls.switch("i_lattice", "lattice of the microlenses", True, id="i-lattice")
+                controls.switch("i_dots", "dots of the board, named; residuals x 50", True)
+                controls.switch("i_axes", "axes x and y of the volume", True)
+                controls.switch("i_pixels", "saturated and hot pixels", True)
                 html.Div("cameras: {{ i_source }}", v_if="i_source", classes="lf-note")
                 html.H3("Counts")
-                controls.slider("i_low", "black", 0, ("i_top",), ("i_top / 500",), unit="counts")
-                controls.slider("i_high", "white", 0, ("i_top",), ("i_top / 500",), unit="counts")
+                controls.slider("i_low", "black", 0, ("i_top",), ("i_top / 500",), 0.0, unit="counts")
+                controls.slider("i_high", "white", 0, ("i_top",), ("i_top / 500",), 1.0, unit="counts")
                 html.Div("{{ fact }}", v_for="fact in i_facts", key="fact", classes="lf-note")
                 html.Div(v_html=("i_chart",))
                 html.H3("Through one point of the pupil")
-                controls.switch("i_follow", "follows the pointer")
+                controls.switch("i_follow", "follows the pointer", True)
                 for name in "uv":
-                    controls.slider(f"i_{name}", name, ("-i_radius",), ("i_radius",), ("i_radius / 50",), unit="mm")
+                    ends = ("-i_radius",), ("i_radius",)
+                    controls.slider(f"i_{name}", name, *ends, ("i_radius / 50",), 0.0, unit="mm")
                 html.H3("Refocused")
-                controls.slider("i_z", "z", ("i_depth[0]",), ("i_depth[1]",), 0.01, unit="mm")
+                controls.slider("i_z", "z", ("i_depth[0]",), ("i_depth[1]",), 0.01, 0.0, unit="mm")
                 controls.switch("i_both", "two cameras at once: red and cyan", id="i-both")
             with html.Div(classes="lf-main"), html.Div(classes="lf-pictures"):
                 Picture(

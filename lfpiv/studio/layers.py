@@ -1,4 +1,4 @@
-"""Layers of a picture of vectors, made with PyVista. "Copy as Python" copies this file."""
+"""Layers of a picture of vectors, made with PyVista."""
 
 from __future__ import annotations
 
@@ -138,24 +138,25 @@ def stream_lines(grid: pv.ImageData, seeds: int, colour: str, moving: bool = Fal
     return lines if moving or not lines.n_points else lines.tube(radius=grid.length / 500, n_sides=4)
 
 
-def points_of(table: xr.Dataset, columns: tuple[str, str, str]) -> pv.PolyData:
-    """Return particles as points, coloured by their speed [m/s] where it is known."""
-    good = table["valid"].values if "valid" in table else np.ones(table.sizes["particle"], bool)
-    cloud = pv.PolyData(np.column_stack([table[name].values[good] for name in columns]).astype(np.float32))
+def points_of(table: xr.Dataset, good: np.ndarray | None = None) -> pv.PolyData:
+    """Return particles, the valid or other good entries, as points, coloured by their speed [m/s] where it is known."""
+    if good is None:
+        good = table["valid"].values if "valid" in table else np.ones(table.sizes["particle"], bool)
+    cloud = pv.PolyData(np.column_stack([table[name].values[good] for name in "xyz"]).astype(np.float32))
     if "u" in table:
         cloud["speed"] = np.sqrt(sum(table[name].values[good] ** 2 for name in "uvw")).astype(np.float32)
     return cloud
 
 
-def track_lines(table: xr.Dataset, columns: tuple[str, str, str], until: int | None = None) -> pv.PolyData:
+def track_lines(table: xr.Dataset, until: int | None = None) -> pv.PolyData:
     """Return the tracks of particles as lines, up to an instant if it is given."""
     good = table["valid"].values.astype(bool)
     if until is not None and "instant" in table:
         good &= table["instant"].values <= until
-    places = np.column_stack([table[name].values[good] for name in columns]).astype(np.float32)
     ends = np.flatnonzero(np.diff(table["track"].values[good])) + 1
-    parts = [part for part in np.split(np.arange(len(places)), ends) if len(part) > 1]
-    lines = pv.PolyData(places, lines=np.concatenate([[len(part), *part] for part in parts]) if parts else None)
-    if "u" in table:
-        lines["speed"] = np.sqrt(sum(table[name].values[good] ** 2 for name in "uvw")).astype(np.float32)
-    return lines
+    parts = [part for part in np.split(np.arange(good.sum()), ends) if len(part) > 1]
+    lines = np.concatenate([[len(part), *part] for part in parts]) if parts else None
+    cloud = points_of(table, good)
+    tracks = pv.PolyData(cloud.points, lines=lines)
+    tracks.point_data.update(cloud.point_data)
+    return tracks

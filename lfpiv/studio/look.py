@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -71,6 +69,16 @@ def own_limits(grid: pv.ImageData, name: str) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
+def look_along(plotter: pv.Plotter, view: str, bounds: Any) -> None:
+    """Look at a box along an axis, or obliquely; without bounds at all that is drawn."""
+    camera, plotter.camera_position = plotter.camera, VIEWS.get(view, "xy")
+    if view not in "xyz":
+        camera.azimuth, camera.elevation = 25.0, 20.0
+    plotter.reset_camera(bounds=bounds, render=False)
+    camera.zoom(0.78)
+    plotter.renderer.ResetCameraClippingRange()
+
+
 @dataclass
 class Picture:
     """A plotter that shows a look, and draws anew only the layers that changed."""
@@ -95,10 +103,8 @@ class Picture:
     ) -> None:
         """Draw what differs from what is drawn; less of what would take long while something moves."""
         self.drawn["whole"] = whole  # its id names it as long as it lives
-        grid, key = whole, (id(whole), look.hide_replaced, look.uncertainty)
-        if self.drawn.get("trusted key") != key:
-            self.drawn |= {"trusted key": key, "trusted": layers.trusted(whole, look.hide_replaced, look.uncertainty)}
-        grid = self.drawn["trusted"]
+        key = (id(whole), look.hide_replaced, look.uncertainty)
+        grid = self._kept("trusted", key, lambda: layers.trusted(whole, look.hide_replaced, look.uncertainty))
         limits = look.limits or self.limits(whole, look.colour)
         cmap = look.colours or ("coolwarm" if look.colour in SIGNED else "viridis")
         ink = INK[look.theme]
@@ -146,9 +152,12 @@ class Picture:
 
     def limits(self, grid: pv.ImageData, name: str) -> tuple[float, float]:
         """Return the ends of the colour scale of a field, which are computed once."""
-        if self.drawn.get("limits key") != (id(grid), name):
-            self.drawn |= {"limits key": (id(grid), name), "limits": own_limits(grid, name)}
-        return self.drawn["limits"]  # type: ignore[no-any-return]
+        return self._kept("limits", (id(grid), name), lambda: own_limits(grid, name))  # type: ignore[no-any-return]
+
+    def _kept(self, name: str, key: Any, make: Any) -> Any:
+        if self.drawn.get(f"{name} key") != key:
+            self.drawn |= {f"{name} key": key, name: make()}
+        return self.drawn[name]
 
     def _layer(self, name: str, key: Any, make: Any, moving: bool = False, **style: Any) -> None:
         """Draw a layer unless it is drawn from the same; remove it without a key."""
@@ -185,16 +194,8 @@ class Picture:
         scale.lookup_table = pv.LookupTable(paint["cmap"], scalar_range=paint["clim"])
         plotter.add_scalar_bar(mapper=scale, render=False, **bar)
         if not self.placed:
-            self.look_along("oblique", grid.bounds)
+            look_along(plotter, "oblique", grid.bounds)
             self.placed = True
-
-    def look_along(self, view: str, bounds: Any) -> None:
-        """Look at a box along an axis, or obliquely."""
-        camera, self.plotter.camera_position = self.plotter.camera, VIEWS[view]
-        if view == "oblique":
-            camera.azimuth, camera.elevation = 25.0, 20.0
-        self.plotter.reset_camera(bounds=bounds, render=False)
-        camera.zoom(0.78)
 
     def image(self) -> np.ndarray:
         """Return the picture, shape (rows, columns, 3)."""
@@ -217,8 +218,6 @@ def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tu
     size : (int, int)
         Columns and rows of the picture.
     """
-    body = inspect.getsource(layers).partition("from __future__ import annotations\n")[2]
-    own = inspect.getsource(sys.modules[__name__]).partition("\n\nBACKGROUND = {")[2].rpartition("\n\n\ndef script(")[0]
     stated = [
         (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
     ]
@@ -226,14 +225,13 @@ def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tu
     clouds, number = "", look.moment if look.moment.isdigit() else None
     chosen = "" if number is None else f", pairs=({number}, {number} + 1)"  # other files may be damaged
     if look.particles:
-        clouds += f'    clouds["particles"] = points_of(lfpiv.open_particles(results{chosen}), ("x", "y", "z"))\n'
+        clouds += f'    clouds["particles"] = points_of(lfpiv.open_particles(results{chosen}))\n'
     if look.tracks:
-        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), ("x", "y", "z"), {number})\n'
+        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), {number})\n'
     return (
         '"""Draw vectors as they were seen in lfpiv studio. Needs lfpiv and pyvista."""\n\n'
-        "from __future__ import annotations\n\nfrom dataclasses import dataclass, field\nfrom typing import Any\n"
-        f"{body}\n\nBACKGROUND = {{{own.replace('layers.', '')}\n\n\n"
-        f"RESULTS = {list(results)!r}\nLOOK = Look(\n{values})\n\n"
+        "import lfpiv\nfrom lfpiv.studio.layers import field_at, grid_of, points_of, track_lines\n"
+        f"from lfpiv.studio.look import Look, Picture\n\nRESULTS = {list(results)!r}\nLOOK = Look(\n{values})\n\n"
         "for number, results in enumerate(RESULTS):\n"
         f"    grid = grid_of(field_at(lfpiv.open_results(results{chosen}), LOOK.moment))\n"
         f"    clouds = {{}}\n{clouds}"
@@ -241,6 +239,6 @@ def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tu
         f"    picture.show(grid, LOOK, clouds, {title!r})\n"
         f"    picture.plotter.camera_position = {camera!r}\n"
         "    picture.plotter.renderer.reset_camera_clipping_range()\n"
-        "    picture.image()\n"
+        "    picture.image()  # before it, add to picture.plotter what PyVista draws\n"
         '    picture.plotter.screenshot("picture%s.png" % (number or ""))\n'
     )

@@ -15,7 +15,7 @@ from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
 from lfpiv.studio import delivery, warning_cards
-from lfpiv.studio.access import Places
+from lfpiv.studio.access import Places, belongs, is_run
 from lfpiv.studio.form_tab import Form
 from lfpiv.studio.images_tab import Images
 from lfpiv.studio.preview_tab import Preview
@@ -43,7 +43,7 @@ def build(given: Path) -> Session:
         {"serve": {"lfpiv_studio": str(static)}, "scripts": ["lfpiv_studio/studio.js"],
          "styles": ["lfpiv_studio/studio.css"], "vue_use": ["lfpivStudio"]}
     )  # fmt: skip
-    session = Session(server, Places(roots_of(given)))
+    session = Session(server, Places(root_of(given)))
     _open(session, given)
     state = server.state
     state.update({"tab": "results" if session.results else next(iter(TABS)), "theme": "light", "message": ""})
@@ -65,14 +65,8 @@ def build(given: Path) -> Session:
     return session
 
 
-def routes(session: Session) -> list[web.RouteDef]:
+def routes() -> list[web.RouteDef]:
     """Return the addresses beside the page, all guarded by the token."""
-
-    async def picture(request: web.Request) -> web.Response:
-        content = session.offered.get(int(request.match_info["number"]))
-        if content is None:
-            raise web.HTTPNotFound
-        return web.Response(body=content, content_type="application/octet-stream")
 
     async def words(request: web.Request) -> web.Response:
         content = warning_cards.page(request.match_info["name"])
@@ -80,28 +74,27 @@ def routes(session: Session) -> list[web.RouteDef]:
             raise web.HTTPNotFound(text="This page is not installed; it lies in docs/ of the sources of lfpiv.")
         return web.Response(text=content, content_type="text/html")
 
-    return [web.get(r"/data/{number:\d+}", picture), web.get(r"/pages/{name:\w+}", words)]
+    return [web.get(r"/pages/{name:\w+}", words)]
 
 
-def roots_of(given: Path) -> tuple[Path, ...]:
-    """Return the folders that may be looked at: a given folder, or the folder of a given file, run or store."""
-    return (given if given.is_dir() and not is_store(given) and not _is_run(given) else given.parent,)
-
-
-def _is_run(folder: Path) -> bool:
-    return (folder / "vectors").is_dir() or (folder / "summary.json").is_file()
+def root_of(given: Path) -> Path:
+    """Return the folder that may be looked at: a given folder, or the folder of a given file, run or store."""
+    return given if given.is_dir() and not is_store(given) and not is_run(given) else given.parent
 
 
 def _open(session: Session, given: Path) -> None:
-    """Open what was given, and what belongs to it."""
+    """Open what was given, and what belongs to it; of a folder what lies nearest to it."""
+    found, runs = session.places.experiments(), session.places.results()
     if given.is_file() and given.suffix == ".toml":
         session.experiment = given
-    elif is_store(given) or _is_run(given):
+    elif is_store(given) or is_run(given):
         session.results = given
-    if session.experiment is None:
-        session.experiment = _nearest(session.places.experiments(), session.results or given)
+        session.experiment = _nearest([path for path in found if belongs(path, given)], given)
+    else:
+        session.experiment = _nearest(found, given)
     if session.results is None:
-        session.results = _nearest(session.places.results(), session.experiment or given)
+        own = session.experiment
+        session.results = _nearest([run for run in runs if own is None or belongs(own, run)], own or given)
 
 
 def _nearest(found: list[Path], other: Path) -> Path | None:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
+import copy
 import json
 import subprocess
 import sys
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyvista as pv
-import tomlkit
 import trame_client.widgets.html as html
 
 import lfpiv
 from lfpiv.errors import InputError
-from lfpiv.quantities import duration
-from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.studio import controls, layers, look
-from lfpiv.studio.field_names import title_of
+from lfpiv.studio.charts import title_of
+from lfpiv.studio.draft import Draft
 from lfpiv.studio.session import Session
 
 FEW_VOXELS = 60_000
@@ -28,8 +27,6 @@ FEW_VOXELS = 60_000
 
 AUTOMATIC = ("smart.sieve_voxel", "smart.intensity_cap", "correlation.max_displacement_voxel")
 """Settings that have a value of their own unless a box is ticked."""
-
-TABLES: dict[str, type[Smart | Correlation]] = {"smart": Smart, "correlation": Correlation}
 
 SLIDERS = (
     ("correlation.overlap", "overlap of windows", 0.0, 0.9, 0.05, 0.5),
@@ -57,12 +54,8 @@ class Preview:
         self.grids: list[pv.ImageData | None] = [None, None]
         self.pictures = (look.Picture.empty((600, 600)), look.Picture.empty((600, 600)))
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
-        values = {state_of(key): first for key, _, _, _, _, first in SLIDERS}
-        values |= {f"{state_of(key)}_auto": True for key in AUTOMATIC}
-        self.state.update(
-            {"t_pair": 0, "t_pairs": 1, "t_coarser": 1.0, "t_windows": "", "t_busy": "", "t_before": "", "t_after": "",
-             "t_plan": [], "t_plane": 0.5, "t_colour": "speed", "t_voxels": ""} | values
-        )  # fmt: skip
+        self.state.update(dict.fromkeys(("t_windows", "t_busy", "t_before", "t_after", "t_voxels"), ""))
+        self.state.update({"t_pairs": 1, "t_plan": []})
         self.state.change("t_plane", "t_colour", "theme")(lambda **_: session.guarded(self.draw)())
         self.state.change("t_coarser")(lambda **_: self._tell_voxels())
         session.listeners.append(self._changed)
@@ -77,10 +70,8 @@ class Preview:
             value = draft.get(key.split("."))
             stated = isinstance(value, int | float) and not isinstance(value, bool)
             s[state_of(key)] = value if stated else first
-            if key in AUTOMATIC:
-                s[f"{state_of(key)}_auto"] = not stated
-        windows = draft.get(("correlation", "windows"))
-        s.t_windows = tomlkit.item(windows).as_string() if windows is not None else ""
+            s[f"{state_of(key)}_auto"] = not stated
+        s.t_windows = draft.texts()["correlation.windows"]
         count = draft.get(("particles", "pairs")) or draft.get(("particles", "instants"))
         s.t_pairs = count if isinstance(count, int) else 1
         if what == "experiment":
@@ -90,60 +81,51 @@ class Preview:
 
     def _voxels(self) -> float:
         """Return the number of voxels that the file states; 1 where it cannot be told."""
-        draft = self.session.draft
         try:
-            assert draft is not None
-            size, edge = (draft.get(("volume", key)) for key in ("size_mm", "voxel_mm"))
+            size, edge = (self.session.edited.get(("volume", key)) for key in ("size_mm", "voxel_mm"))
             return float(np.prod(np.asarray(size, float) / float(edge)))
-        except (AssertionError, TypeError, ValueError, ZeroDivisionError):
+        except (TypeError, ValueError, ZeroDivisionError):
             return 1.0
 
     def _tell_voxels(self) -> None:
         self.state.t_voxels = f"{self._voxels() / float(self.state.t_coarser) ** 3:,.0f} voxels"
 
-    def changed(self) -> dict[str, dict[str, Any]]:
-        """Return the settings that the sliders state, by table."""
-        found: dict[str, dict[str, Any]] = {"smart": {}, "correlation": {}}
-        for key, _, _, _, step, _ in SLIDERS:
-            table, name = key.split(".")
-            if key in AUTOMATIC and self.state[f"{state_of(key)}_auto"]:
-                found[table][name] = TABLES[table].model_fields[name].default
-                continue
-            value = self.state[state_of(key)]
-            found[table][name] = int(value) if isinstance(step, int) else float(value)
-        found["correlation"]["windows"] = None
-        if str(self.state.t_windows).strip():
-            try:
-                windows = tomlkit.parse(f"windows = {self.state.t_windows}").unwrap()["windows"]
-            except Exception:
-                raise InputError("windows: expected a list such as [32, 16, 12], found other text.") from None
-            found["correlation"]["windows"] = windows
-        return found
+    def trial(self) -> Draft:
+        """Return the experiment as the form has it, with the settings of the sliders that differ from it."""
+        draft, s = copy.deepcopy(self.session.edited), self.state
+        for key, _, _, _, step, first in SLIDERS:
+            place, default = key.split("."), None if key in AUTOMATIC else first
+            value = type(step)(s[state_of(key)])
+            wanted = None if key in AUTOMATIC and s[f"{state_of(key)}_auto"] else value
+            stated = draft.get(place)
+            if wanted != (default if stated in (None, "auto") else stated):
+                draft.set(place, None if wanted == default else wanted)
+        if (windows := str(s.t_windows).strip()) != draft.texts()["correlation.windows"]:
+            draft.write(("correlation", "windows"), windows, plain=False)
+        for name, text in draft.problems().items():
+            raise InputError(f"{name}: {text}".lstrip(": "))
+        return draft
 
     def try_it(self) -> None:
         """Measure the pair with the settings of the sliders."""
-        if self.session.experiment is None:
-            raise InputError("experiment: expected an experiment file, found none. Open it in the tab Experiment.")
-        if self.state.t_busy:
-            return
-        changed = self.changed()
-        self.session.start(self._try(changed))
+        if not self.state.t_busy:
+            self.session.start(self._try(self.trial()))
 
-    async def _try(self, changed: dict[str, Any]) -> None:
+    async def _try(self, draft: Draft) -> None:
         session = self.session
         with session.busy("t_busy", "measuring the pair"), tempfile.TemporaryDirectory(prefix="lfpiv-") as folder:
             request = {
-                "experiment": str(session.experiment), "results": str(session.results or ""), "changed": changed,
+                "experiment": str(draft.path), "results": str(session.results or ""), "values": draft.values,
                 "pair": int(self.state.t_pair), "coarser": float(self.state.t_coarser), "out": folder,
             }  # fmt: skip
-            answer = await self._ask(["-m", "lfpiv.studio.trial"], json.dumps(request))
-            if "error" in answer:
-                raise InputError(answer["error"])
+            answer = json.loads((await self._ask(["-m", "lfpiv.studio.trial"], json.dumps(request)))[-1])
             grid = layers.grid_of(lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze())
         with self.state:
             self.grids = [self.grids[1] if self.grids[1] is not None else grid, grid]
-            uncertain = f", uncertainty {answer['uncertainty']} voxel" if answer["uncertainty"] is not None else ""
-            text = f"{answer['valid']} % of {answer['vectors']:,} vectors valid{uncertain}, {answer['seconds']} s"
+            known = "uncertainty" in grid.point_data and np.isfinite(grid["uncertainty"]).any()
+            uncertain = f", uncertainty {np.nanmedian(grid['uncertainty']):.3g} voxel" if known else ""
+            valid = f"{100 * grid['valid'].mean():.1f} % of {grid.n_points:,} vectors valid"
+            text = f"{valid}{uncertain}, {answer['seconds']} s"
             text += "" if answer["calibrated"] else "; nominal cameras, not calibrated yet"
             self.state.t_before, self.state.t_after = self.state.t_after or text, text
             self.draw()
@@ -168,14 +150,7 @@ class Preview:
 
     def keep(self) -> None:
         """Write the settings of the sliders that differ from the file into the form."""
-        draft = self.session.draft
-        if draft is None:
-            return
-        for table, settings in self.changed().items():
-            for name, value in settings.items():
-                stated, default = draft.get((table, name)), TABLES[table].model_fields[name].default
-                if value != (default if stated is None else stated):
-                    draft.set((table, name), None if value == default else value)
+        self.session.draft = self.trial()
         self.session.told("draft")
         self.state.tab = "experiment"
 
@@ -185,27 +160,21 @@ class Preview:
             self.session.start(self._plan())
 
     async def _plan(self) -> None:
-        command = ["-m", "lfpiv", "plan", str(self.session.experiment), "--json", "--quiet"]
+        command = ["-m", "lfpiv", "plan", str(self.session.experiment), "--quiet"]
         if self.session.results is not None and self.session.results.is_dir():
             command += ["--out", str(self.session.results)]
         with self.session.busy("t_busy", "doing the first pair, whose times are scaled"):
-            answer = await self._ask(command, "")
+            lines = await self._ask(command, "")
         with self.state:
-            times = {name: value for name, value in answer["time"].items() if isinstance(value, int | float)}
-            memory = {name.replace("_", " "): value for name, value in answer["memory_bytes"].items() if value}
-            self.state.t_plan = [
-                *(f"{name.removesuffix('_s').replace('_', ' ')}: {duration(value)}" for name, value in times.items()),
-                *(f"memory, {name}: {value / 2**20:,.0f} MiB" for name, value in memory.items()),
-                *answer["limits"],
-            ]
+            self.state.t_plan = lines
 
-    async def _ask(self, arguments: list[str], text: str) -> dict[str, Any]:
-        """Call Python with arguments, and a text as its standard input; return the JSON on its standard output."""
+    async def _ask(self, arguments: list[str], text: str) -> list[str]:
+        """Call Python with arguments, and a text as its standard input; return the lines of its standard output."""
         run = partial(subprocess.run, [sys.executable, *arguments], input=text, capture_output=True, text=True)
-        done = await self.session.aside(run)
-        if done.returncode or "{" not in done.stdout:
+        done = await asyncio.to_thread(run)
+        if done.returncode:
             raise InputError((done.stderr.splitlines() or [f"{arguments[1]}: ended without an answer."])[-1])
-        return dict(json.loads(done.stdout[done.stdout.index("{") :]))
+        return list(done.stdout.splitlines())
 
     def _panel(self) -> None:
         guarded = self.session.guarded
@@ -221,29 +190,25 @@ class Preview:
                     "Try measures a pair by correlation on longer voxels: fast, and less accurate than a run. Change a "
                     "slider and try again: before and after stand side by side.", classes="lf-note",
                 )  # fmt: skip
-                controls.slider("t_pair", "pair", 0, ("t_pairs - 1",), 1, v_if="t_pairs > 1")
-                controls.slider("t_coarser", "voxels longer by", 1.0, 4.0, 0.1)
+                controls.slider("t_pair", "pair", 0, ("t_pairs - 1",), 1, 0, v_if="t_pairs > 1")
+                controls.slider("t_coarser", "voxels longer by", 1.0, 4.0, 0.1, 1.0)
                 html.Div("{{ t_voxels }}", classes="lf-note")
                 html.H3("Correlation and SMART")
                 with html.Div(classes="lf-slider"):
                     html.Label("windows of the passes [voxel]", raw_attrs=['for="t-windows"'])
                     html.Input(
-                        v_model=("t_windows",),
-                        placeholder="[32, 16, 12, 12]",
-                        id="t-windows",
-                        classes="lf-typed",
-                        style="grid-column: 1 / -1",
-                    )
-                for key, label, low, high, step, _ in SLIDERS:
-                    name = state_of(key)
+                        v_model=("t_windows",), placeholder="[32, 16, 12, 12]", id="t-windows",
+                        classes="lf-typed", style="grid-column: 1 / -1",
+                    )  # fmt: skip
+                for key, label, *numbers in SLIDERS:
+                    name, more = state_of(key), {}
                     if key in AUTOMATIC:
-                        controls.switch(f"{name}_auto", f"{label.partition(' [')[0]}: automatic")
-                        controls.slider(name, label, low, high, step, v_if=f"!{name}_auto")
-                    else:
-                        controls.slider(name, label, low, high, step)
+                        controls.switch(f"{name}_auto", f"{label.partition(' [')[0]}: automatic", True)
+                        more = {"v_if": f"!{name}_auto"}
+                    controls.slider(name, label, *numbers, **more)
                 html.H3("Shown")
-                controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01)
-                controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],))
+                controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01, 0.5)
+                controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],), "speed")
             with html.Div(classes="lf-main lf-double", v_show="t_after"), html.Div(classes="lf-views"):
                 names = [f"{name}: {{{{ t_{name} }}}}" for name in ("before", "after")]
                 plotters = [picture.plotter for picture in self.pictures]

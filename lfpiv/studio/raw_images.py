@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
 
 HOT_SIGMA, HOT_RATIO = 12.0, 5.0
 """Least height of a hot pixel: in standard deviations of the noise, and over the height of its highest neighbour."""
+KEPT_IMAGES = 3
+"""Images, and what is seen in them, that are kept."""
 MOST_LISTED = 1000
 """Largest number of frames of particles that are listed."""
 MOST_MARKS = 3000
@@ -41,23 +42,21 @@ PUPIL_POINTS = 19
 """Points of the pupil whose views are summed into a refocused plane."""
 
 
-@dataclass
 class RawImages:
-    """The images of an open experiment; decoded cameras and views are kept."""
+    """The images of an open experiment, with the last ones that were read, and their cameras.
 
-    experiment: Experiment
-    results: Path | None = None
-    """Folder of a run, whose calibration is taken; without one, cameras are nominal thin lenses."""
-    cameras: dict[str, CalibratedCamera] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    measured: bool = False
-    """Whether the cameras are calibrated."""
-    grids: dict[str, np.ndarray] = field(default_factory=dict)
-    """Lattice indices of a rectangle of lenses of each camera."""
-    signal: tuple[np.ndarray, np.ndarray] | None = None
-    """The last image that was seen through the pupil, and its light above the dark level."""
-    views: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
-    """Pupil views of the last images."""
+    Without the folder of a run, whose calibration is taken, cameras are nominal thin lenses.
+    """
+
+    def __init__(self, experiment: Experiment, results: Path | None = None) -> None:
+        self.experiment, self.results = experiment, results
+        self.cameras: dict[str, CalibratedCamera] = {}
+        self.measured = False  # whether the cameras are calibrated
+        self._lock = threading.Lock()
+        self.read, self._signal, self._views = (
+            lru_cache(KEPT_IMAGES)(call) for call in (self._read, self._above_dark, self._pupil_views)
+        )
+        self._lens_grid = cache(lambda camera: self.calibrated(camera).decoder.lens_grid())
 
     def _readers(self, camera: str) -> dict[str, Callable[[], np.ndarray | None]]:
         """Return what reads each image of a camera: white, dark, plane N, background F, and frames or instants."""
@@ -75,7 +74,7 @@ class RawImages:
         """Return the names of a camera's images."""
         return list(self._readers(camera))
 
-    def read(self, camera: str, name: str) -> np.ndarray:
+    def _read(self, camera: str, name: str) -> np.ndarray:
         """Return an image as lfpiv reads it, float32 (rows, columns) [counts]."""
         image = self._readers(camera).get(name, lambda: None)()
         if image is None:
@@ -84,23 +83,14 @@ class RawImages:
 
     def calibrated(self, camera: str) -> CalibratedCamera:
         """Return a camera: from the results, or a thin lens in its nominal place."""
-        with self.lock:
-            return self._known()[camera]
-
-    def _known(self) -> dict[str, CalibratedCamera]:
-        if not self.cameras:
-            file = Folder(self.results).calibration if self.results is not None else None
-            if file is not None and file.is_file():
-                self.cameras, self.measured = dict(lfpiv.load_calibration(file).cameras), True
-            if set(self.cameras) != {setup.name for setup in self.experiment.cameras}:
-                self.cameras, self.measured = dict(lfpiv.thin_lens(self.experiment).cameras), False
-        return self.cameras
-
-    def lens_grid(self, camera: str) -> np.ndarray:
-        """Return the lattice indices of a rectangle of lenses that covers the sensor, shape (I, J, 2)."""
-        if camera not in self.grids:
-            self.grids[camera] = self.calibrated(camera).decoder.lens_grid()
-        return self.grids[camera]
+        with self._lock:
+            if not self.cameras:
+                file = Folder(self.results).calibration if self.results is not None else None
+                names = {setup.name for setup in self.experiment.cameras}
+                stored = lfpiv.load_calibration(file).cameras if file is not None and file.is_file() else {}
+                self.measured = set(stored) == names
+                self.cameras = dict(stored if self.measured else lfpiv.thin_lens(self.experiment).cameras)
+            return self.cameras[camera]
 
     def recorded(self, camera: str, array: np.ndarray) -> np.ndarray:
         """Return an image as its camera recorded it, which undoes what reading did."""
@@ -119,7 +109,7 @@ class RawImages:
     def lattice_px(self, camera: str) -> np.ndarray:
         """Return the centres of the microimages where the lattice has them, shape (lens, 2)."""
         found = self.calibrated(camera)
-        centres = self._light_px(camera, found.lattice.centres_mm(self.lens_grid(camera).reshape(-1, 2)))
+        centres = self._light_px(camera, found.lattice.centres_mm(self._lens_grid(camera).reshape(-1, 2)))
         rows, columns = found.optics.sensor_shape
         return centres[((centres > -0.5) & (centres < (columns - 0.5, rows - 0.5))).all(1)]
 
@@ -185,15 +175,25 @@ class RawImages:
         shrink = min(1.0, 0.95 * radius / max(float(np.hypot(u, v)), 1e-9))
         return float(u) * shrink, float(v) * shrink
 
-    def pupil_view(self, camera: str, image: np.ndarray, pupil_mm: tuple[float, float]) -> np.ndarray:
-        """Return the scene as it is seen through a pupil point: a value for each lens; 0 where none is seen."""
+    def _above_dark(self, camera: str, name: str) -> np.ndarray:
+        image: np.ndarray = self.read(camera, name)
+        return np.asarray(image - np.float32(self.calibrated(camera).decoder.background(image)[0]))
+
+    def pupil_view(self, camera: str, name: str, pupil_mm: tuple[float, float]) -> np.ndarray:
+        """Return an image as it is seen through a pupil point: a value for each lens; 0 where none is seen."""
         found = self.calibrated(camera)
-        if self.signal is None or self.signal[0] is not image:
-            self.signal = image, image - np.float32(found.decoder.background(image)[0])
-        values = found.decoder.sample(self.signal[1], self.lens_grid(camera), pupil_mm)
+        values = found.decoder.sample(self._signal(camera, name), self._lens_grid(camera), pupil_mm)
         basis = np.asarray(found.lattice.basis_mm)
         along = values.T if abs(basis[0][0]) >= abs(basis[0][1]) else values
         return self.recorded(camera, np.nan_to_num(along))
+
+    def _pupil_views(self, camera: str, name: str) -> np.ndarray:
+        """Return the views of an image through `PUPIL_POINTS` points, shape (point, i, j)."""
+        points = self._points(camera)[:, None, None]
+        return self.calibrated(camera).decoder.sample(self._signal(camera, name), self._lens_grid(camera), points)
+
+    def _points(self, camera: str) -> np.ndarray:
+        return spread_over_pupil(0.9 * self.calibrated(camera).optics.pupil_radius_mm)[:PUPIL_POINTS]
 
     def refocused(self, camera: str, name: str, z_mm: float) -> np.ndarray:
         """Return the light that comes from a plane of the volume, x to the right and y up; 0 where none is seen.
@@ -201,33 +201,17 @@ class RawImages:
         The light of `PUPIL_POINTS` pupil views is summed along the rays of the camera.
         """
         found, grid = self.calibrated(camera), self.experiment.grid
-        pupil = spread_over_pupil(0.9 * found.optics.pupil_radius_mm)[:PUPIL_POINTS]
-        stack = self._stack(camera, name, pupil)
-        ny, nx = grid.shape[1:]
-        step = max(nx, ny) * grid.voxel_mm / REFOCUSED
-        x = grid.centre_mm[0] + (np.arange(round(nx * grid.voxel_mm / step)) + 0.5) * step - nx * grid.voxel_mm / 2
-        y = grid.centre_mm[1] - (np.arange(round(ny * grid.voxel_mm / step)) + 0.5) * step + ny * grid.voxel_mm / 2
-        points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z_mm)], axis=-1).reshape(-1, 3)
+        sides = grid.voxel_mm * np.array(grid.shape[:0:-1])
+        counts = np.rint(REFOCUSED * sides / sides.max()).astype(int)
+        x, y = (side * ((np.arange(count) + 0.5) / count - 0.5) for side, count in zip(sides, counts, strict=True))
+        points = np.stack(np.meshgrid(grid.centre_mm[0] + x, grid.centre_mm[1] - y, [z_mm]), axis=-1).reshape(-1, 3)
         origin, basis = np.asarray(found.lattice.origin_mm), np.linalg.inv(np.asarray(found.lattice.basis_mm))
-        low = self.lens_grid(camera)[0, 0].astype(float)
-        total, seen = np.zeros(len(points)), np.zeros(len(points))
-        fan = found.map_fan(points, pupil)
-        for number in range(len(pupil)):
-            at = (fan[:, number] - origin) @ basis - low
-            value = scipy.ndimage.map_coordinates(stack[number], at.T, order=1, cval=np.nan, prefilter=False)
-            total += np.nan_to_num(value)
-            seen += np.isfinite(value)
-        mean = np.divide(total, seen, out=np.zeros_like(total), where=seen > 0)
-        return mean.reshape(len(y), len(x)).astype(np.float32)
-
-    def _stack(self, camera: str, name: str, pupil: np.ndarray) -> np.ndarray:
-        """Return the pupil views of an image, shape (point, i, j); the last images' views are kept."""
-        key = (camera, name)
-        if key not in self.views:
-            while len(self.views) > 3:
-                self.views.pop(next(iter(self.views)))
-            image, found = self.read(camera, name), self.calibrated(camera)
-            signal = image - np.float32(found.decoder.background(image)[0])
-            index = self.lens_grid(camera)
-            self.views[key] = np.stack([found.decoder.sample(signal, index, point) for point in pupil])
-        return self.views[key]
+        low = self._lens_grid(camera)[0, 0].astype(float)
+        lenses = (found.map_fan(points, self._points(camera)) - origin) @ basis - low
+        views = self._views(camera, name)
+        seen = [
+            scipy.ndimage.map_coordinates(view, at.T, order=1, cval=np.nan, prefilter=False)
+            for view, at in zip(views, np.moveaxis(lenses, 1, 0), strict=True)
+        ]
+        mean: np.ndarray = np.nansum(seen, axis=0) / np.maximum(np.isfinite(seen).sum(axis=0), 1)
+        return mean.reshape(counts[::-1])

@@ -16,7 +16,7 @@ from trame.widgets import vuetify3 as v3
 
 from lfpiv.results import tables
 from lfpiv.studio import controls, layers, look
-from lfpiv.studio.field_names import title_of
+from lfpiv.studio.charts import title_of
 
 FRAMES_PER_S = {"turn": 20, "series": 8}
 """Pictures of a film per second."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,14 @@ import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.results.reader import open_readable
 from lfpiv.studio import charts, controls, layers, look
-from lfpiv.studio.field_names import LABELS, SURFACES, title_of
+from lfpiv.studio.charts import LABELS, title_of
 from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
 COLOURS = ("", "viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
 CLOUDS = ("particles", "tracks")
+PLAIN = ("moment", "colour", "colours", "level", "opacity", "length", "replaced", "lines", *CLOUDS)
+"""What is shown as the state has it."""
 MOST_ARROWS = 40
 """Largest number of arrows along an axis that the slider gives: more fill the picture, and take seconds."""
 REST_S = 0.25
@@ -43,21 +45,14 @@ class Results:
         self.rest: asyncio.TimerHandle | None = None
         self.state.update(
             {
-                "r_moment": "0", "r_moments": [], "r_numbers": 0, "r_step": 0, "r_colour": "speed", "r_fields": [],
-                "r_colours": "", "r_own": True, "r_low": 0.0, "r_high": 1.0, "r_on_x": False, "r_on_y": False,
-                "r_on_z": True, "r_x": 0.0, "r_y": 0.0, "r_z": 0.0, "r_box": [[0, 1, 0.1]] * 3, "r_surface": "",
-                "r_surfaces": [], "r_level": 0.0, "r_ends": [0.0, 1.0, 0.01], "r_opacity": 0.6, "r_arrows": False,
-                "r_every": 1, "r_fewest": 1, "r_length": 1.5, "r_replaced": False, "r_hide": True, "r_limited": False,
-                "r_uncertainty": 0.5, "r_lines": 0, "r_particles": False, "r_tracks": False, "r_has": [],
-                "r_playing": False, "r_chart": "", "r_chart_kind": "histogram", "r_other": "", "r_others": [],
-                "r_open": "", "r_left": {},
+                "r_moments": [], "r_numbers": 0, "r_fields": [], "r_box": [[0, 1, 0.1]] * 3,
+                "r_ends": [0.0, 1.0, 0.01], "r_fewest": 1, "r_has": [], "r_playing": False, "r_chart": "",
+                "r_others": [], "r_left": {},
             }
         )  # fmt: skip
-        watched = """
-            moment colour colours own low high on_x on_y on_z x y z surface level opacity arrows every length replaced
-            hide limited uncertainty lines particles tracks other chart_kind
-        """
-        self.state.change("theme", *(f"r_{name}" for name in watched.split()))(lambda **_: self.request())
+        others = "own low high on_x on_y on_z x y z hide every limited other chart_kind".split()
+        watched = (f"r_{name}" for name in (*(item.name for item in fields(look.Look)), *others))
+        self.state.change("theme", *watched)(lambda **_: self.request())
         self.state.change("r_step")(self._step_to)
         self.state.change("r_surface")(lambda **_: self._range_of_level())
         self.state.change("r_playing")(lambda **_: session.start(self._play()))
@@ -115,10 +110,10 @@ class Results:
         """Return particles or tracks at a moment; None for particles of a statistic."""
         number = int(moment) if moment.isdigit() else None
         if name == "tracks":
-            return layers.track_lines(lfpiv.open_tracks(folder), ("x", "y", "z"), number)
+            return layers.track_lines(lfpiv.open_tracks(folder), number)
         if number is None:
             return None
-        return layers.points_of(lfpiv.open_particles(folder, pairs=(number, number + 1)), ("x", "y", "z"))
+        return layers.points_of(lfpiv.open_particles(folder, pairs=(number, number + 1)))
 
     def _first_look(self) -> None:
         """Choose places, levels and lists that suit the fields."""
@@ -128,10 +123,8 @@ class Results:
         state.r_x, state.r_y, state.r_z = (float(value) for value in grid.center)
         names = [name for name in (*LABELS, *grid.array_names) if name in grid.array_names and name != "velocity"]
         state.r_fields = [{"title": title_of(name), "value": name} for name in dict.fromkeys(names)]
-        some = [name for name in SURFACES if name in grid.array_names]
-        state.r_surfaces = [{"title": title_of(name) if name else "none", "value": name} for name in ("", *some)]
         state.r_every, state.r_fewest = (max(1, round(max(grid.dimensions) / n)) for n in (16, MOST_ARROWS))
-        state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in some else ""
+        state.r_surface = "vorticity_magnitude" if "vorticity_magnitude" in names else ""
         self._range_of_level()
 
     def _range_of_level(self) -> None:
@@ -150,27 +143,19 @@ class Results:
     def wanted(self) -> look.Look:
         """What the state asks for."""
         s = self.state
+        plain = {name: type(getattr(look.Look, name))(s[f"r_{name}"]) for name in PLAIN}
         return look.Look(
-            moment=str(s.r_moment), colour=s.r_colour, colours=s.r_colours,
-            limits=None if s.r_own else (float(s.r_low), max(float(s.r_high), float(s.r_low) + 1e-9)),
+            **plain, limits=None if s.r_own else (float(s.r_low), max(float(s.r_high), float(s.r_low) + 1e-9)),
             slices=tuple(float(s[f"r_{a}"]) if s[f"r_on_{a}"] else None for a in "xyz"),  # type: ignore[arg-type]
-            surface=s.r_surface or None, level=float(s.r_level), opacity=float(s.r_opacity),
-            arrows=int(s.r_every) if s.r_arrows else 0, length=float(s.r_length), replaced=bool(s.r_replaced),
-            hide_replaced=bool(s.r_hide), uncertainty=float(s.r_uncertainty) if s.r_limited else None,
-            lines=int(s.r_lines), particles=bool(s.r_particles), tracks=bool(s.r_tracks), theme=s.theme,
+            surface=s.r_surface or None, arrows=int(s.r_every) if s.r_arrows else 0, hide_replaced=bool(s.r_hide),
+            uncertainty=float(s.r_uncertainty) if s.r_limited else None, theme=s.theme,
         )  # fmt: skip
 
     def request(self) -> None:
         """Draw soon. Requests that come meanwhile are answered by the same picture."""
-        if self.pending:
-            return
-        try:
-            loop = asyncio.get_running_loop()
-        except RuntimeError:  # before the server runs
-            self.session.guarded(self.draw)(True)
-            return
-        self.pending = True
-        loop.call_soon(self._draw_requested)
+        if not self.pending:
+            self.pending = True
+            asyncio.get_running_loop().call_soon(self._draw_requested)
 
     def _draw_requested(self) -> None:
         self.pending = False
@@ -260,11 +245,8 @@ class Results:
             await asyncio.sleep(1 / FRAMES_PER_S["series"])
 
     def look_along(self, name: str) -> None:
-        """Turn the camera to a view by its name, or by steps."""
-        if name in controls.TURNS:
-            controls.turn(self.pictures[0].plotter.camera, name)
-        else:
-            self.pictures[0].look_along(name, self.grid(str(self.session.results), self.wanted.moment).bounds)
+        """Turn the camera to a view by its name."""
+        look.look_along(self.pictures[0].plotter, name, self.grid(str(self.session.results), self.wanted.moment).bounds)
         for picture, view in zip(self.pictures, self.views, strict=True):
             picture.plotter.renderer.ResetCameraClippingRange()
             view.update()
@@ -293,50 +275,54 @@ class Results:
             with html.Div(v_for="card in cards", key="card.name", classes="lf-card lf-left", role="alert"):
                 html.B("{{ card.name }} is left out")
                 html.Div("{{ card.why }}")
-        controls.choice("r_moment", "shown", ("r_moments",), id="r-moment")
+        html.Div(
+            "The studio's folder holds no experiment file of these results.", v_if="results_name && !experiment_name",
+            classes="lf-note", id="r-alone",
+        )  # fmt: skip
+        controls.choice("r_moment", "shown", ("r_moments",), "0", id="r-moment")
         with html.Div(v_if="r_numbers > 1"):
-            controls.slider("r_step", "through the series", 0, ("r_numbers - 1",), 1)
+            controls.slider("r_step", "through the series", 0, ("r_numbers - 1",), 1, 0)
             controls.button("{{ r_playing ? 'Stop' : 'Play' }}", "r_playing = !r_playing", id="r-play")
-        controls.choice("r_colour", "colour", ("r_fields",), id="r-colour")
+        controls.choice("r_colour", "colour", ("r_fields",), "speed", id="r-colour")
         maps = [{"title": name or "viridis, signed fields coolwarm", "value": name} for name in COLOURS]
         controls.choice("r_colours", "colour map", (maps,))
-        controls.switch("r_own", "colours over the field's own range")
+        controls.switch("r_own", "colours over the field's own range", True)
         with html.Div(v_if="!r_own"):
             step = ("(r_high - r_low) / 100",)
-            controls.slider("r_low", "lowest", ("Math.min(r_low, -Math.abs(r_high))",), ("r_high",), step)
-            controls.slider("r_high", "highest", ("r_low",), ("2 * Math.abs(r_high) || 1",), step)
+            controls.slider("r_low", "lowest", ("Math.min(r_low, -Math.abs(r_high))",), ("r_high",), step, 0.0)
+            controls.slider("r_high", "highest", ("r_low",), ("2 * Math.abs(r_high) || 1",), step, 1.0)
 
     def _layer_controls(self) -> None:
         html.H3("Planes")
         for number, axis in enumerate("xyz"):
-            controls.switch(f"r_on_{axis}", f"plane normal to {axis}", id=f"r-on-{axis}")
+            controls.switch(f"r_on_{axis}", f"plane normal to {axis}", axis == "z", id=f"r-on-{axis}")
             low, high, step = (f"r_box[{number}][{part}]" for part in range(3))
-            controls.slider(f"r_{axis}", axis, (low,), (high,), (step,), unit="mm", v_if=f"r_on_{axis}")
+            controls.slider(f"r_{axis}", axis, (low,), (high,), (step,), 0.0, unit="mm", v_if=f"r_on_{axis}")
         html.H3("Isosurface")
-        controls.choice("r_surface", "field", ("r_surfaces",), id="r-surface")
+        controls.choice("r_surface", "field", ("[{title: 'none', value: ''}, ...r_fields]",), id="r-surface")
         with html.Div(v_if="r_surface"):
-            controls.slider("r_level", "level", ("r_ends[0]",), ("r_ends[1]",), ("r_ends[2]",))
-            controls.slider("r_opacity", "opacity", 0.1, 1, 0.05)
+            controls.slider("r_level", "level", ("r_ends[0]",), ("r_ends[1]",), ("r_ends[2]",), 0.0)
+            controls.slider("r_opacity", "opacity", 0.1, 1, 0.05, 0.6)
         html.H3("Arrows and streamlines")
         controls.switch("r_arrows", "arrows", id="r-arrows")
         with html.Div(v_if="r_arrows"):
-            controls.slider("r_every", "on every n-th vector", ("r_fewest",), ("r_fewest + 9",), 1)
-            controls.slider("r_length", "length", 0.2, 6, 0.1)
-        controls.slider("r_lines", "streamlines", 0, 300, 5)
+            controls.slider("r_every", "on every n-th vector", ("r_fewest",), ("r_fewest + 9",), 1, 1)
+            controls.slider("r_length", "length", 0.2, 6, 0.1, 1.5)
+        controls.slider("r_lines", "streamlines", 0, 300, 5, 0)
         with html.Div(v_if="r_has.includes('particles')"):
             controls.switch("r_particles", "particles")
         with html.Div(v_if="r_has.includes('tracks')"):
             controls.switch("r_tracks", "tracks")
         html.H3("Trust")
-        controls.switch("r_hide", "leave out replaced vectors")
+        controls.switch("r_hide", "leave out replaced vectors", True)
         controls.switch("r_replaced", "show replaced vectors in grey")
         controls.switch("r_limited", "leave out uncertain vectors")
-        controls.slider("r_uncertainty", "largest uncertainty", 0, 2, 0.02, unit="voxel", v_if="r_limited")
+        controls.slider("r_uncertainty", "largest uncertainty", 0, 2, 0.02, 0.5, unit="voxel", v_if="r_limited")
 
     def _chart_controls(self) -> None:
         html.H3("Chart")
         kinds = ["histogram", "x", "y", "z"]
-        controls.choice("r_chart_kind", "histogram, or profile along an axis", (kinds,))
+        controls.choice("r_chart_kind", "histogram, or profile along an axis", (kinds,), "histogram")
         html.Div(v_html=("r_chart",))
 
     def _view_controls(self) -> None:
@@ -344,8 +330,8 @@ class Results:
         with html.Div(classes="lf-buttons"):
             for name in look.VIEWS:
                 controls.button(name, (self.look_along, f"['{name}']"))
-            for name, icon in zip(controls.TURNS, "⟲⟳↑↓+−", strict=True):
-                controls.button(
-                    icon, (self.look_along, f"['{name}']"), raw_attrs=[f'aria-label="turn {name}"'], id=f"r-turn-{name}"
-                )
+            names = ("left", "right", "up", "down", "closer", "farther")
+            for name, icon, key in zip(names, "⟲⟳↑↓+−", controls.KEYS, strict=True):
+                said = [f'aria-label="turn {name}"']
+                controls.button(icon, f"trigger('results_key', ['{key}'])", raw_attrs=said, id=f"r-turn-{name}")
         controls.choice("r_other", "side by side with", ("r_others",), id="r-other")

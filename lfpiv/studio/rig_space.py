@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike
 
-from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
+from lfpiv.settings.rig import Board, CameraTable
+from lfpiv.settings.volume import Box, HalfSpace
 
 SEEN_VOXELS = 32
 """Places along the longest axis at which it is counted how many cameras see them."""
@@ -19,66 +19,45 @@ REACH = 2.0
 UNKNOWN_PIXELS = (2048, 2048)
 """Sensor of a camera whose white image is not there yet, (rows, columns)."""
 
-View = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+@dataclass(frozen=True)
+class View:
+    """A nominal camera as VTK knows cameras: in the middle of its main lens, looking at the origin [mm]."""
+
+    camera: pv.Camera
+    aspect: float
+    """Columns of the sensor for each of its rows."""
+
+    @classmethod
+    def of(cls, table: CameraTable, shape: tuple[int, int]) -> View:
+        """Return the view of a camera of the experiment file, with the rows and columns of its sensor."""
+        optics, camera = table.optics_of(shape), pv.Camera()
+        _, up, towards = (table.orientation or Orientation(0.0)).rotation
+        camera.position, camera.up = optics.object_distance_mm * towards, up
+        half = 0.5 * shape[0] * optics.pixel_mm / abs(optics.magnification)
+        camera.view_angle = 2 * np.degrees(np.arctan2(half, optics.object_distance_mm))
+        return cls(camera, shape[1] / shape[0])
+
+    def pyramid(self, length: float) -> pv.PolyData:
+        """Return the lines through the corners of what is seen, about the plane of focus, cut at a length before it."""
+        distance, parts = self.camera.distance, []
+        share = min(1.0, length / distance)
+        for near, far in ((max(1 - share, 1e-3), 1.0), (1.0, 1 + 0.35 * share)):
+            self.camera.clipping_range = near * distance, far * distance
+            parts.append(self.camera.view_frustum(self.aspect).extract_all_edges())
+        return pv.merge(parts)
+
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """Return which points lie in the pyramid of view, bool."""
+        planes = [0.0] * 24
+        self.camera.GetFrustumPlanes(self.aspect, planes)
+        sides = np.reshape(planes, (6, 4))[:4]
+        return np.asarray((points @ sides[:, :3].T + sides[:, 3] >= 0).all(axis=1))
 
 
-def view_of(camera: Mapping[str, Any], shape: tuple[int, int]) -> View:
-    """Return where a nominal camera stands and the rectangle that it sees in its plane of focus.
-
-    Parameters
-    ----------
-    camera : mapping
-        Values of its table in the experiment file.
-    shape : (int, int)
-        Rows and columns of its sensor.
-
-    Returns
-    -------
-    pupil, corners, towards : ndarray, shapes (3,), (4, 3) and (3,)
-        Middle of the main lens, corners of the rectangle, and the unit vector from the origin to the camera [mm].
-    """
-    rows, columns = shape
-    names = ("focal_length_mm", "magnification", "f_number", "microlens_pitch_mm", "microlens_focal_length_mm")
-    numbers: dict[str, Any] = {name: float(camera[name]) for name in names}
-    optics = Optics(**numbers, pixel_mm=float(camera["pixel_um"]) / 1000, sensor_shape=shape)
-    roll, direction = float(camera.get("nominal_roll_deg", 0.0)), camera.get("nominal_direction")
-    if direction is None:
-        orientation = Orientation(float(camera.get("nominal_angle_deg", 0.0)), 0.0, roll)
-    else:
-        orientation = Orientation.from_direction(direction, roll)
-    right, up, towards = orientation.rotation
-    half_x, half_y = (0.5 * n * optics.pixel_mm / abs(optics.magnification) for n in (columns, rows))
-    corners = np.array([a * half_x * right + b * half_y * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-    return optics.object_distance_mm * towards, corners, towards
-
-
-def pyramid(pupil: np.ndarray, corners: np.ndarray, length: float) -> pv.PolyData:
-    """Return the lines from a camera's lens through the corners of what it sees, cut at a length from the origin."""
-    distance = float(np.linalg.norm(pupil))
-    share = min(1.0, length / distance)
-    near = corners + share * (pupil - corners)
-    far = corners - 0.35 * share * (pupil - corners)
-    points = np.vstack([near, far, corners])
-    lines = [[2, a, a + 4] for a in range(4)]
-    lines += [[2, base + a, base + (a + 1) % 4] for base in (0, 4, 8) for a in range(4)]
-    return pv.PolyData(points, lines=np.concatenate(lines))
-
-
-def body(pupil: np.ndarray, length: float, size: float) -> pv.PolyData:
-    """Return a cone where a camera stands, or on the way to it where that is far; it points at the volume."""
-    towards = pupil / np.linalg.norm(pupil)
-    place = towards * min(length, float(np.linalg.norm(pupil)))
-    return pv.Cone(center=place, direction=-towards, height=size, radius=size / 2)
-
-
-def inside(pupil: np.ndarray, corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return which points lie in the pyramid of view of a camera, bool."""
-    towards = pupil / np.linalg.norm(pupil)
-    depth = (pupil - points) @ towards
-    plane = pupil + (points - pupil) * (np.linalg.norm(pupil) / np.maximum(depth, 1e-9))[:, None]
-    across, up = (corners[1] - corners[0]) / 2, (corners[3] - corners[0]) / 2
-    seen = (np.abs(plane @ across) <= across @ across) & (np.abs(plane @ up) <= up @ up) & (depth > 0)
-    return np.asarray(seen)
+def body(place: np.ndarray, size: float) -> pv.PolyData:
+    """Return a cone where a camera stands; it points at the origin."""
+    return pv.Cone(center=place, direction=-place, height=size, radius=size / 2)
 
 
 def count_seen(views: list[View], centre: np.ndarray, size: np.ndarray) -> pv.ImageData:
@@ -86,25 +65,21 @@ def count_seen(views: list[View], centre: np.ndarray, size: np.ndarray) -> pv.Im
     counts = np.maximum(2, np.round(SEEN_VOXELS * size / size.max())).astype(int)
     grid = pv.ImageData(dimensions=counts + 1, spacing=size / counts, origin=centre - size / 2)
     points = np.asarray(grid.cell_centers().points, float)
-    seen = [inside(pupil, corners, points) for pupil, corners, _ in views]
-    grid.cell_data["cameras"] = np.sum(seen, axis=0).astype(np.float32)
+    grid.cell_data["cameras"] = np.sum([view.sees(points) for view in views], axis=0).astype(np.float32)
     return grid
 
 
-def board_plane(board: Mapping[str, Any], z_mm: float) -> pv.PolyData:
+def board_plane(board: Board, z_mm: float) -> pv.PolyData:
     """Return the dots of a plane of the board as points."""
-    nx, ny = board["dots"]
-    x, y = ((np.arange(n) - (n - 1) / 2) * float(board["spacing_mm"]) for n in (nx, ny))
-    points = np.stack(np.meshgrid(x, y, [z_mm]), axis=-1).reshape(-1, 3)
-    return pv.PolyData(points)
+    x, y = ((np.arange(n) - (n - 1) / 2) * board.spacing_mm for n in board.dots)
+    return pv.PolyData(np.stack(np.meshgrid(x, y, [z_mm]), axis=-1).reshape(-1, 3))
 
 
-def solid_shape(solid: Mapping[str, Any], centre: np.ndarray, size: np.ndarray) -> pv.DataSet:
-    """Return the part of a solid that lies in the volume."""
-    if solid["kind"] == "half_space":
-        box = pv.Box(bounds_of(centre, size))
-        return box.clip_closed_surface(normal=-np.asarray(solid["normal"], float), origin=solid["point_mm"])
-    return pv.Box(bounds_of(solid["centre_mm"], solid["size_mm"]))
+def solid_shape(solid: Box | HalfSpace, volume: np.ndarray) -> pv.DataSet:
+    """Return the part of a solid that lies in the bounds of the volume."""
+    if isinstance(solid, HalfSpace):
+        return pv.Box(volume).clip_closed_surface(normal=-np.asarray(solid.normal, float), origin=solid.point_mm)
+    return pv.Box(bounds_of(solid.centre_mm, solid.size_mm))
 
 
 def bounds_of(centre: ArrayLike, size: ArrayLike) -> np.ndarray:

@@ -19,22 +19,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from lfpiv.errors import InputError
 from lfpiv.progress import PROGRESS_FILE
 from lfpiv.quantities import duration
 from lfpiv.records import RecordError, read_object, read_text
 from lfpiv.results.folder import Folder, make_writable
+from lfpiv.warn import Warning
 
 LOG, PROGRESS = ".run.log", ".run.jsonl"
 PAIR_STEPS = ("image pairs", "instants")
+SIGNALS = {"pause": (signal.SIGSTOP,), "resume": (signal.SIGCONT,), "stop": (signal.SIGCONT, signal.SIGINT)}
 REPORT_S = 20.0
 """Time that the report of a run takes [s]."""
 LEAST_FRACTION, SURE_FRACTION, SURE_S = 0.02, 0.1, 60.0
 """Smallest finished fractions of a step from which its remaining time is told: after `SURE_S`, and before [s]."""
 SHOWN_PAIRS = 12
 """Pairs, the latest, that have a bar."""
-SHOWN_LINES = 60
-"""Lines of the log that are shown."""
 LARGEST_BYTES = 1 << 20
 """Bytes at the end of log and progress that are read."""
 
@@ -52,12 +54,10 @@ def holder(out: Path) -> Holder | None:
     try:
         found = read_object(read_text(Folder(out).lock))
         process = int(found["process"])
-        if found["host"] != socket.gethostname():
-            return None
-        os.kill(process, 0)
+        here = found["host"] == socket.gethostname() and psutil.pid_exists(process)
     except (OSError, RecordError, KeyError, TypeError, ValueError):
         return None
-    return Holder(process, str(found.get("since", ""))[:40])
+    return Holder(process, str(found.get("since", ""))[:40]) if here else None
 
 
 def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
@@ -81,64 +81,46 @@ def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
     with (out / LOG).open("wb") as log:
         log.write(("$ lfpiv " + " ".join(command[3:]) + "\n").encode(errors="replace"))
         log.flush()
-        process = subprocess.Popen(
+        process = psutil.Popen(
             command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, PROGRESS_FILE: str(out / PROGRESS)}, cwd=experiment.parent,
         )  # fmt: skip
-    _children.append(process)
-    return process.pid
+    _children[process.pid] = process
+    return int(process.pid)
 
 
-_children: list[subprocess.Popen[bytes]] = []
+_children: dict[int, psutil.Popen] = {}
 """Runs that this studio started: they are asked for their status, or they stay as zombies."""
 
 
 def status(process: int) -> str:
     """Return "running", "paused" or "ended"."""
-    own = next((child for child in _children if child.pid == process), None)
+    own = _children.get(process)
     if own is not None and own.poll() is not None:
         return "ended"
     try:
-        state = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
-    except OSError:
-        try:
-            os.kill(process, 0)
-        except OSError:
-            return "ended"
-        return "running"
-    gone = "running" if own is not None else "ended"  # the last threads of a process end after its first
-    return {"T": "paused", "t": "paused", "Z": gone, "X": gone}.get(state, "running")
+        state = psutil.Process(process).status()
+    except psutil.Error:
+        return "ended"
+    if state in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+        return "ended" if own is None else "running"  # the last threads of a process end after its first
+    return "paused" if state in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP) else "running"
 
 
 def exit_status(process: int) -> int | None:
     """Return the exit status of a run that this studio started and that ended; None otherwise."""
-    return next((child.poll() for child in _children if child.pid == process), None)
+    return _children[process].poll() if process in _children else None
 
 
-def pause(process: int) -> None:
-    """Stop a run and its workers where they are."""
-    _send(process, signal.SIGSTOP)
+def control(process: int, what: str) -> None:
+    """Let a run and its workers "pause" where they are or "resume", or "stop" the run as Ctrl-C does.
 
-
-def resume(process: int) -> None:
-    """Let a paused run go on."""
-    _send(process, signal.SIGCONT)
-
-
-def stop(process: int) -> None:
-    """End a run as Ctrl-C does: what is finished stays, and the same command goes on from there."""
-    _send(process, signal.SIGCONT)
-    with contextlib.suppress(OSError):
-        os.kill(process, signal.SIGINT)
-
-
-def _send(process: int, what: signal.Signals) -> None:
-    """Send a signal to a process and to its group where it leads one."""
-    with contextlib.suppress(OSError):
-        if os.getpgid(process) == process:
-            os.killpg(process, what)
-        else:
-            os.kill(process, what)
+    What is finished stays when a run is stopped, and the same command goes on from there.
+    """
+    for number in SIGNALS[what]:
+        with contextlib.suppress(OSError):
+            leads = os.getpgid(process) == process and number != signal.SIGINT
+            (os.killpg if leads else os.kill)(process, number)
 
 
 def tail(path: Path) -> str:
@@ -149,11 +131,6 @@ def tail(path: Path) -> str:
             return file.read().decode("utf-8", errors="replace")
     except OSError:
         return ""
-
-
-def log_lines(out: Path) -> list[str]:
-    """Return the last lines of the log of a run."""
-    return tail(out / LOG).splitlines()[-SHOWN_LINES:]
 
 
 def logged_warnings(out: Path) -> list[str]:
@@ -204,9 +181,7 @@ def time_left(out: Path) -> str:
 def finished_warnings(out: Path) -> list[dict[str, Any]]:
     """Return the warnings of a finished run: its records, each with the sentence."""
     try:
-        summary = read_object(read_text(Folder(out).summary))
-    except (OSError, RecordError):
+        records = read_object(read_text(Folder(out).summary))["warning_records"]
+        return [{**record, "text": Warning.from_json(record).sentence} for record in records]
+    except (OSError, RecordError, KeyError, TypeError):
         return []
-    sentences, records = (list(summary.get(name) or []) for name in ("warnings", "warning_records"))
-    records = [record if isinstance(record, dict) else {} for record in [*records, *sentences][: len(sentences)]]
-    return [{**record, "text": str(sentence)} for sentence, record in zip(sentences, records, strict=True)]

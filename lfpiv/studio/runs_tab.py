@@ -14,6 +14,8 @@ from lfpiv.errors import InputError
 from lfpiv.studio import controls, run_process, warning_cards
 from lfpiv.studio.session import Session
 
+SHOWN_LINES = 60
+"""Lines of the log that are shown."""
 LOOK_EVERY_S = 0.5
 """Time between two looks at a run [s]."""
 
@@ -27,9 +29,8 @@ class Runs:
         self.stopped = False
         self.state.update(
             {
-                "p_out": "results", "p_pairs": "", "p_volumes": False, "p_workers": "", "p_status": "none",
-                "p_stages": [], "p_log": "", "p_warnings": [], "p_end": "", "p_stop_with_studio": False,
-                "p_left": "",
+                "p_out": "results", "p_pairs": "", "p_workers": "", "p_status": "none", "p_stages": [], "p_log": "",
+                "p_warnings": [], "p_end": "", "p_left": "",
             }
         )  # fmt: skip
         session.listeners.append(self._changed)
@@ -53,18 +54,12 @@ class Runs:
     def start(self) -> None:
         """Start the run that is asked for; a finished part in the folder is not repeated."""
         session, s = self.session, self.state
-        if session.experiment is None:
-            raise InputError(
-                "experiment: expected an experiment file to run, found none. Open it in the tab Experiment."
-            )
-        if session.draft is not None and session.draft.changed:
+        if session.edited.changed:
             raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
-        options = [*(["--pairs", str(s.p_pairs)] if s.p_pairs else []), *(["--keep-volumes"] if s.p_volumes else [])]
-        if s.p_workers:
-            options += ["--workers", str(s.p_workers)]
-        if any(option.startswith("-") for option in (str(s.p_pairs), str(s.p_workers))):
-            raise InputError("pairs, workers: expected numbers, found an option.")
-        self.process = run_process.start(session.experiment, self.out, options)
+        given = {"--pairs": s.p_pairs, "--workers": s.p_workers}
+        options = [f"{name}={value}" for name, value in given.items() if value]
+        options += ["--keep-volumes"] if s.p_volumes else []
+        self.process = run_process.start(session.edited.path, self.out, options)
         s.p_end, s.p_warnings = "", []
         self._look()
 
@@ -72,7 +67,7 @@ class Runs:
         """Pause, resume or stop the run."""
         if self.process is not None:
             self.stopped = what == "stop"
-            getattr(run_process, what)(self.process)
+            run_process.control(self.process, what)
         self._look()
 
     async def _watch(self) -> None:
@@ -95,7 +90,7 @@ class Runs:
         now = "none" if self.process is None else run_process.status(self.process)
         if now in ("running", "paused") or s.p_status in ("running", "paused"):
             s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
-            s.p_log = "\n".join(run_process.log_lines(out))
+            s.p_log = "\n".join(run_process.tail(out / run_process.LOG).splitlines()[-SHOWN_LINES:])
             s.p_warnings = self._cards({"text": text} for text in run_process.logged_warnings(out))
         if s.p_status in ("running", "paused") and now == "ended":
             self._ended(out)
@@ -116,13 +111,13 @@ class Runs:
 
     def _cards(self, warnings: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         draft = self.session.draft
-        cameras = [str(camera.get("name")) for camera in draft.values.get("camera", [])] if draft is not None else []
+        cameras = [] if draft is None else [str(camera.get("name")) for camera in draft.get(("camera",)) or []]
         return [warning_cards.card(warning, cameras) for warning in warnings]
 
     def _close(self) -> None:
         """End the run with the studio if that is asked for; otherwise leave it."""
         if self.process is not None and self.state.p_stop_with_studio:
-            run_process.stop(self.process)
+            run_process.control(self.process, "stop")
 
     def _page(self) -> None:
         control = self.session.guarded(self.control)

@@ -15,9 +15,7 @@ from typing import Any
 
 from lfpiv.errors import InputError
 
-log = logging.getLogger(__name__)
-
-NEEDED = ("trame", "trame_vtk", "trame_vuetify", "pyvista", "tomlkit", "imageio_ffmpeg")
+NEEDED = ("trame", "trame_vtk", "trame_vuetify", "pyvista", "tomlkit", "imageio_ffmpeg", "psutil")
 """Packages of the extra `studio`."""
 
 
@@ -32,17 +30,15 @@ def require_extra() -> None:
         )
 
 
-def quiet_vtk() -> None:
-    """Let VTK log errors only. It warns where it finds no screen, and then draws without."""
-    from vtkmodules.vtkCommonCore import vtkLogger
-
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
-
-
 def quiet_closed_pages() -> None:
-    """Let the server of messages not log that a page was closed while something was sent to it."""
-    known = logging.getLogger("wslink.protocol")
-    known.addFilter(lambda _: not isinstance(sys.exc_info()[1], ConnectionError))
+    """Let neither the server of messages nor its loop log that a page was closed while something was sent to it."""
+
+    def kept(record: logging.LogRecord) -> bool:
+        _, error, _ = record.exc_info or sys.exc_info()
+        return not isinstance(error, ConnectionError)
+
+    for name in ("wslink.protocol", "asyncio"):
+        logging.getLogger(name).addFilter(kept)
 
 
 def serve(
@@ -71,20 +67,30 @@ def serve(
         If packages of the extra are missing, or there is nothing at `path`.
     """
     require_extra()
-    from lfpiv.studio import access, page
-
     given = Path.cwd() if path is None else Path(path)
     if not given.exists():
         raise InputError(f"{given}: expected an experiment file or the results of a run, found nothing there.")
-    quiet_vtk()
     quiet_closed_pages()
-    token = access.Token()
-    session = page.build(given.resolve())
+    arguments, sys.argv = sys.argv, sys.argv[:1]  # trame reads them
+    try:
+        asyncio.run(_run(given.resolve(), port, browser, ready))
+    finally:
+        sys.argv = arguments
+
+
+async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], None] | None) -> None:
+    """Serve until a signal comes. Then runs are closed or left, and the process ends whatever its threads read."""
+    import pyvista
+
+    from lfpiv.studio import access, page
+
+    pyvista.vtk_verbosity("error")  # VTK warns where it finds no screen, and then draws without
+    token, session = access.Token(), page.build(given)
     server = session.server
 
     def bind(bound: Any) -> None:
         bound.app.middlewares.append(token.middleware())
-        bound.app.add_routes(page.routes(session))
+        bound.app.add_routes(page.routes())
 
     def started(**_: Any) -> None:
         address = f"http://127.0.0.1:{server.port}/index.html?token={token.word}"
@@ -93,35 +99,20 @@ def serve(
         if browser:
             webbrowser.open(address)
 
-    server.controller.on_server_bind.add(bind)
-    server.controller.on_server_ready.add(started)
-    arguments, sys.argv = sys.argv, sys.argv[:1]  # trame reads them
-    try:
-        asyncio.run(_run(session, port))
-    except OSError as error:
-        raise InputError(f"port {port}: {(error.strerror or str(error)).lower()}. Choose another --port.") from None
-    finally:
-        sys.argv = arguments
-
-
-async def _run(session: Any, port: int) -> None:
-    """Serve until a signal comes. Then runs are closed or left, and the process ends whatever its threads read."""
-
     def end() -> None:
         for close in session.closers:
             close()
         sys.stdout.flush()
         os._exit(0)
 
-    def failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        if not isinstance(context.get("exception"), ConnectionError):  # which a page that is closed leaves behind
-            loop.default_exception_handler(context)
-
-    loop = asyncio.get_running_loop()
-    loop.set_exception_handler(failed)
+    server.controller.on_server_bind.add(bind)
+    server.controller.on_server_ready.add(started)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, end)
-    await session.server.start(  # thread: no handlers of signals besides those above
-        port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
-        disable_logging=True, timeout=0, thread=True,
-    )  # fmt: skip
+        asyncio.get_running_loop().add_signal_handler(number, end)
+    try:
+        await server.start(  # thread: no handlers of signals besides those above
+            port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
+            disable_logging=True, timeout=0, thread=True,
+        )  # fmt: skip
+    except OSError as error:
+        raise InputError(f"port {port}: {(error.strerror or str(error)).lower()}. Choose another --port.") from None

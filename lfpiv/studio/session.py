@@ -18,8 +18,7 @@ from lfpiv.studio.draft import Draft
 
 log = logging.getLogger(__name__)
 
-MOST_OFFERED = 24
-"""Largest number of pictures that wait to be fetched by the page."""
+NO_EXPERIMENT = "No experiment file is open: choose one in the tab Experiment."
 
 
 @dataclass
@@ -39,14 +38,18 @@ class Session:
     closers: list[Callable[[], None]] = field(default_factory=list)
     """Called when the studio ends."""
     tasks: set[asyncio.Task[Any]] = field(default_factory=set)
-    offered: dict[int, bytes] = field(default_factory=dict)
-    """Pictures that the page fetches, by number."""
-    count: int = 0
 
     @property
     def state(self) -> Any:
         """The state that page and server share."""
         return self.server.state
+
+    @property
+    def edited(self) -> Draft:
+        """The experiment file as it is edited; InputError where none that can be read is open."""
+        if self.draft is None:
+            raise InputError("experiment: expected a readable experiment file, found none. Open one in tab Experiment.")
+        return self.draft
 
     def choose(self, what: str, path: str) -> None:
         """Open another "experiment" or other "results"."""
@@ -88,11 +91,6 @@ class Session:
 
     def start(self, work: Coroutine[Any, Any, Any]) -> None:
         """Do work beside the page, which stays alive; its errors are shown there."""
-        try:
-            loop = asyncio.get_running_loop()
-        except RuntimeError:  # before the server runs; its start tells all states again
-            work.close()
-            return
 
         async def watched() -> None:
             try:
@@ -101,7 +99,7 @@ class Session:
                 with self.state:
                     self.tell(error)
 
-        task = loop.create_task(watched())
+        task = asyncio.get_running_loop().create_task(watched())
         self.tasks.add(task)
         task.add_done_callback(self.tasks.discard)
 
@@ -116,15 +114,9 @@ class Session:
             with self.state:
                 self.state[name] = ""
 
-    def offer(self, picture: np.ndarray) -> dict[str, Any]:
-        """Offer a picture of counts, (rows, columns) or (rows, columns, 3), to the page; return what it fetches."""
-        self.count += 1
-        self.offered[self.count] = np.ascontiguousarray(picture, "<f4").tobytes()
-        while len(self.offered) > MOST_OFFERED:
-            self.offered.pop(next(iter(self.offered)))
-        rows, columns, channels = (*picture.shape, 1)[:3]
-        return {"url": f"data/{self.count}", "rows": rows, "columns": columns, "channels": channels}
 
-    async def aside(self, function: Callable[..., Any], *given: Any) -> Any:
-        """Compute in another thread and return the result."""
-        return await asyncio.get_running_loop().run_in_executor(None, function, *given)
+def sent(picture: np.ndarray) -> dict[str, Any]:
+    """Return a picture of counts, (rows, columns) or (rows, columns, 3), as a value of the state."""
+    rows, columns, channels = (*picture.shape, 1)[:3]
+    values = np.ascontiguousarray(picture, "<f4").tobytes()
+    return {"values": values, "rows": rows, "columns": columns, "channels": channels}

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-NEEDED = ("trame", "trame_vtk", "trame_vuetify", "pyvista", "tomlkit", "imageio_ffmpeg")
+NEEDED = ("trame", "trame_vtk", "trame_vuetify", "pyvista", "tomlkit", "imageio_ffmpeg", "psutil")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -26,7 +26,7 @@ def test_places_outside_the_folders_are_refused(tmp_path):
     for folder in (inside, outside):
         folder.mkdir()
     (inside / "link").symlink_to(outside)
-    places = Places((inside.resolve(),))
+    places = Places(inside.resolve())
     assert places.within("a/b") == inside.resolve() / "a" / "b"
     for wrong in ("..", str(outside), "link/results", "/etc/passwd", "a/../../outside"):
         with pytest.raises(InputError, match="expected a place in"):
@@ -43,11 +43,49 @@ def test_a_large_file_a_pipe_and_a_device_beside_the_results_are_no_obstacle(tmp
         file.truncate(LARGE_BYTES)
     tracemalloc.start()
     try:
-        found = Places((tmp_path,)).experiments()
+        found = Places(tmp_path).experiments()
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     assert found == [tmp_path / "large.toml"] and peak < LARGE_BYTES / 16, peak
+
+
+@pytest.mark.parametrize(
+    ("stated", "found"),
+    [
+        (None, {"rig/a.toml", "rig/b.toml"}),  # an unfinished run: both lie beside it
+        ("a.toml", {"rig/a.toml"}),
+        ("../other/a.toml", {"rig/a.toml"}),  # moved since
+        ("away/a.toml", {"away/a.toml", "rig/a.toml"}),
+        ("gone.toml", set()),
+    ],
+)
+def test_results_belong_to_the_experiment_file_that_their_summary_names(tmp_path, stated, found):
+    from lfpiv.studio.access import belongs
+
+    results = tmp_path / "rig" / "results"
+    results.mkdir(parents=True)
+    if stated is not None:
+        (results / "summary.json").write_text(json.dumps({"experiment": {"file": stated}}), "utf-8")
+    files = ("rig/a.toml", "rig/b.toml", "away/a.toml")
+    assert {file for file in files if belongs(tmp_path / file, results)} == found
+
+
+@pytest.mark.browser
+def test_results_without_an_experiment_file_open_none(tmp_path, browser):
+    from support.report_run import field
+    from support.studio_page import served, until
+
+    from lfpiv.results import netcdf
+
+    netcdf.write_vectors(field(0), tmp_path / "run" / "vectors" / "pair_0000.nc", attributes={"pair": 0})
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "experiment.toml").write_text("[[camera]]\nwhite_image = 1\n[volume]\n", "utf-8")
+    with served(tmp_path / "run") as address:
+        browser.get(address)
+        (note,) = until(lambda: browser.find_elements("id", "r-alone"), 60)
+        until(lambda: "no experiment file of these results" in note.text)
+        assert browser.execute_script("return trame.state.get('experiment_name')") == ""
 
 
 def test_a_page_that_closes_while_pictures_come_logs_nothing(caplog):
@@ -97,11 +135,11 @@ def test_a_run_is_paused_resumed_and_stopped():
         start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
     )
-    run_process.pause(process.pid)
+    run_process.control(process.pid, "pause")
     until_status(process.pid, "paused")
-    run_process.resume(process.pid)
+    run_process.control(process.pid, "resume")
     until_status(process.pid, "running")
-    run_process.stop(process.pid)
+    run_process.control(process.pid, "stop")
     assert process.wait(20) == -signal.SIGINT or process.returncode == 1
     assert run_process.status(process.pid) == "ended"
 

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.browser
 FIRST_S, RUN_S = 60, 120
 """Longest time until images are decoded, and until a run has begun or ended [s]."""
 SETTLED_S = 0.5
-"""Time until a view has turned [s]."""
+"""Time until a view has turned, and until the server knows a value that a script sets [s]."""
 FOCUSED = """
 return [...document.querySelectorAll(`#${arguments[0]} :is(input, button, select, textarea, a[href], [tabindex="0"])`)]
   .filter((part) => part.offsetParent && part.tabIndex >= 0 && !part.disabled).map((part) => {
@@ -77,10 +77,11 @@ class Page:
 def test_the_view_through_the_pupil_follows_the_pointer(page):
     page.open("images")
     until(lambda: page.get("i_pupil") and not page.get("i_busy"), FIRST_S)
-    before = page.get("i_pupil")["url"]
+    seen = "return trame.state.get('i_pupil').values.join()"
+    before = page.browser.execute_script(seen)
     picture = page.browser.find_element("css selector", "#tab-images .lf-image canvas")
     ActionChains(page.browser).move_to_element_with_offset(picture, 3, 2).move_by_offset(5, 3).perform()
-    until(lambda: page.get("i_pupil")["url"] != before)
+    until(lambda: page.browser.execute_script(seen) != before)
     assert "column" in page.browser.find_element("class name", "lf-readout").text
     assert {mark["kind"] for mark in page.get("i_marks")} >= {"circles", "arrows"}
 
@@ -225,6 +226,7 @@ def test_a_run_is_started_and_stopped(page):
     page.open("runs")
     assert page.get("p_out") == "results"  # of the open results, as the page calls them
     page.browser.execute_script("trame.state.set('p_out', 'again')")
+    time.sleep(SETTLED_S)  # what is set by a script may come after a click
     page.click("p-start")
     until(lambda: page.get("p_status") == "running" and page.get("p_log"), RUN_S)
     page.click("p-stop")

@@ -9,15 +9,11 @@
       const box = ref(null), canvas = ref(null), readout = ref('');
       let data = null, bitmap = null, view = null, drag = null, moved = 0;
 
-      async function load() {
-        const wanted = props.image;
-        if (!wanted || !wanted.url) return;
-        const answer = await fetch(wanted.url);
-        if (!answer.ok) return;
-        const values = new Float32Array(await answer.arrayBuffer());
-        if (props.image.url !== wanted.url) return;
+      function load() {
+        const wanted = props.image && Vue.toRaw(props.image);
+        if (!wanted) return;
         if (!data || data.rows !== wanted.rows || data.columns !== wanted.columns) view = null;
-        data = { ...wanted, values };
+        data = { ...wanted, values: new Float32Array(wanted.values.slice().buffer) };
         paint();
         look(props.region);
       }
@@ -35,17 +31,14 @@
         draw();
       }
 
-      function fit() {
-        const { width, height } = canvas.value;
-        const scale = Math.min(width / data.columns, height / data.rows) * 0.98;
-        view = { scale, x: (width - data.columns * scale) / 2, y: (height - data.rows * scale) / 2 };
+      function aim(left, top, right, bottom, share) {  // fills this share of the canvas
+        const { width, height } = canvas.value, scale = share * Math.min(width / (right - left), height / (bottom - top));
+        view = { scale, x: (width - scale * (left + right + 1)) / 2, y: (height - scale * (top + bottom + 1)) / 2 };
       }
 
-      function look(region) {  // at left, top, right and bottom, with as much around it
+      function look(region) {
         if (!data || !region || !region.length) return;
-        const [left, top, right, bottom] = region, { width, height } = canvas.value;
-        const scale = Math.min(width / (right - left + 20), height / (bottom - top + 20)) / 2;
-        view = { scale, x: width / 2 - scale * (left + right) / 2, y: height / 2 - scale * (top + bottom) / 2 };
+        aim(region[0] - 10, region[1] - 10, region[2] + 10, region[3] + 10, 0.5);
         draw();
       }
 
@@ -59,7 +52,7 @@
         const context = sheet.getContext('2d');
         context.clearRect(0, 0, width, height);
         if (!bitmap) return;
-        if (!view) fit();
+        if (!view) aim(-0.5, -0.5, data.columns - 0.5, data.rows - 0.5, 0.98);
         context.imageSmoothingEnabled = !!props.smooth || view.scale < 1;
         context.drawImage(bitmap, view.x, view.y, data.columns * view.scale, data.rows * view.scale);
         for (const mark of props.marks || []) drawMark(context, mark);
@@ -157,7 +150,7 @@
       let observer = null;
       onMounted(() => { observer = new ResizeObserver(draw); observer.observe(box.value); load(); });
       onBeforeUnmount(() => observer && observer.disconnect());
-      watch(() => props.image && props.image.url, load);
+      watch(() => props.image, load);
       watch(() => [props.low, props.high], paint);
       watch(() => props.marks, draw);
       watch(() => props.region, look);
