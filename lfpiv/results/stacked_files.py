@@ -147,7 +147,7 @@ class StackedFiles:
     @property
     def attributes(self) -> dict[str, Any]:
         """Attributes that all files share."""
-        names = ("title", "experiment", "step", *COMMON)
+        names = ("title", "experiment", "step", "error_correlation_voxel", *COMMON)
         return {key: self.first.attrs[key] for key in (*names, ATTRIBUTE) if key in self.first.attrs}
 
     def read(self, place: int, names: Sequence[str]) -> list[np.ndarray]:

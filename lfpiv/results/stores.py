@@ -78,8 +78,9 @@ def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Da
     dimension = INSTANT if INSTANT in results.dims else PAIR
     for name in ("history", FORM, hdf5.SEALED, store_seal.OUTLINE, store_seal.CONTENT):
         results.attrs.pop(name, None)
-    if isinstance(edges := results.attrs.get("voxel_mm"), list):
-        results.attrs["voxel_mm"] = np.asarray(edges)
+    for name in ("voxel_mm", "error_correlation_voxel"):
+        if isinstance(lengths := results.attrs.get(name), list):
+            results.attrs[name] = np.asarray(lengths)
     names = [*netcdf.VECTOR_UNITS, *(str(name) for name in results.data_vars if name not in netcdf.VECTOR_UNITS)]
     results = results[names]
     return results if pairs is None else _chosen(results, dimension, pairs, path)

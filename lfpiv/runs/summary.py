@@ -45,6 +45,9 @@ SCHEMA_VERSION = 1
 CORRECTION_RAYS = 4000
 """Number of rays for the network's part in the mapping."""
 
+SETTINGS = ("smart", "correlation", "bootstrap", "tracking", "self_calibration", "network", "compute")
+"""Tables of the experiment file that the summary states, where the run has them."""
+
 MOST_LISTED = 10_000
 """Largest number of pairs with an entry in the summary, and that a warning names. ``pairs.jsonl`` lists more."""
 
@@ -292,9 +295,7 @@ def _settings(experiment: Experiment) -> dict[str, Any]:
             "voxel_mm": experiment.grid.voxel_mm,
             **experiment.recording.stated,
         },
-        "settings": {
-            name: getattr(experiment, name).model_dump() for name in ("smart", "correlation", "network", "compute")
-        },
+        "settings": {name: table.model_dump() for name in SETTINGS if (table := getattr(experiment, name)) is not None},
     }
 
 

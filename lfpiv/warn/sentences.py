@@ -144,10 +144,13 @@ SENTENCES: Mapping[Code, str] = {
         "{share:percent} % of the white image's bright pixels are saturated, so their response is not known; expose "
         "it to two thirds of the range."
     ),
-    Code.LENSES_UNLIT: "lens array: only {lit} of {count} microimages are lit; the others are extrapolated.",
+    Code.LENSES_UNLIT: (
+        "lens array: only {lit} of {count} microimages are lit; the others are extrapolated. Light the white image "
+        "evenly if they show the volume."
+    ),
     Code.LENSES_DISTORTED: (
         "lens array: the microimages leave their lattice by a smooth distortion of {rms_px:.3f} px rms, "
-        "{largest_px:.3f} px at most; centres follow the lattice."
+        "{largest_px:.3f} px at most; centres follow the lattice. The arrows in the report show where."
     ),
     Code.LENSES_IRREGULAR: "microimages lie {rms_px:.2f} px (rms) off a regular lattice; check the white image.",
     Code.BOARD_SATURATED: (
@@ -155,12 +158,18 @@ SENTENCES: Mapping[Code, str] = {
         "accurately; expose the board to two thirds of the range."
     ),
     Code.BOARD_MISPLACED: "{path}: " + _MISPLACED,
-    Code.BOARD_RENAMED: "the board's dots were renamed by {columns} columns and {rows} rows to match its outline",
+    Code.BOARD_RENAMED: (
+        "the board's dots were renamed by {columns} columns and {rows} rows to match its outline. Look at the pictures "
+        "of lfpiv check: the names are wrong if an edge of the board is hidden"
+    ),
     Code.BOARD_EDGE_UNSEEN: (
         "no edge of the board is in view along {axis} ({count} dots, {stated} stated): their numbers are right only "
         "if the camera's axis meets the board within half a spacing ({half_spacing_mm:g} mm) of its middle"
     ),
-    Code.DOT_WIDTH: "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm",
+    Code.DOT_WIDTH: (
+        "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm; the calibration takes what is seen. "
+        "Check board.dot_diameter_mm, focus and exposure"
+    ),
     Code.DOTS_MISSING: (
         "only {found} of {expected} board dots in the field were found; check focus, exposure and the planes listed "
         "in the report.{hint}"
@@ -216,7 +225,9 @@ SENTENCES: Mapping[Code, str] = {
         "{share:percent} % of the volume lies outside the calibrated region ({region} mm), by up to "
         "{distance_mm:.2f} mm: {advice}."
     ),
-    Code.OUTSIDE_SIGHT: "sees only about {share:percent} % of the volume",
+    Code.OUTSIDE_SIGHT: (
+        "sees only about {share:percent} % of the volume. Check volume.centre_mm and volume.size_mm, or turn the camera"
+    ),
     Code.SEEN_BY_ONE: (
         "about {share:percent} % of the volume is seen by fewer than two cameras; vectors there are not valid: {where}"
     ),
@@ -227,7 +238,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.LIGHT_GUARDED: (
         "particles are lit beyond the face {face} of the volume, up to {reach_mm:.2g} mm ({share:percent} % of the "
-        "volume's light): guard layers of {guard_mm:.2g} mm are reconstructed there and cut away"
+        "volume's light): guard layers of {guard_mm:.2g} mm are reconstructed there and cut away. A sheet within the "
+        "volume leaves fewer ghosts"
     ),
     Code.LIGHT_UNGUARDED: (
         "particles are lit beyond the face {face} of the volume, {reach_mm:.2g} mm or more ({share:percent} % of the "
@@ -260,7 +272,7 @@ SENTENCES: Mapping[Code, str] = {
     Code.DIVERGED: "SMART: {verdict}",
     Code.UNEXPLAINED: (
         "the volumes explain little of the images' light (residual {residual:.2f}; 0.3 to 0.6 is usual): do not rely "
-        "on their vectors before the report shows why"
+        "on their vectors. Check the names of the files, the trigger, and whether a camera moved"
     ),
     Code.NOT_JOINT: "no joint fit, vectors of the correlation: {verdict}",
     Code.NOT_FOLLOWED: (
@@ -302,7 +314,7 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.FEWER_WORKERS: (
         "{fits} {noun} instead of {planned}: each takes {each_gib:.1f} GiB of memory, in addition to "
-        "{weights_gib:.1f} GiB of weights"
+        "{weights_gib:.1f} GiB of weights. Results are the same"
     ),
     Code.ONE_GPU: (
         "one of {gpus} GPUs is used: several processes need the package `distributed`. Install it: pip install "

@@ -189,11 +189,11 @@ def warn_of_errors(counted: CountedVoxels, form: str, errors: Sequence[float], *
         if form == "profiles" and requested:
             cause = "profiles suit straight rays and upright arrays; set compute.weights_form to 'auto'"
         elif bent > BENT:
-            cause = "aberrations beyond the third order in the pupil point; weights follow rays up to that order"
+            cause = "aberrations beyond the third order in the pupil point; compute.weights = 'count' follows them"
         elif wide > WIDE:
             cause = "voxels larger than microlenses; lower volume.voxel_mm"
         else:
-            cause = "not known; neither aberrations nor the voxels' size explain it"
+            cause = "not known, neither aberrations nor the voxels' size; compare compute.weights = 'count'"
         figures = {"form": form, "mean": float(np.mean(errors)), "worst": max(errors), "cause": cause}
         figures |= {"aim_mean": AIM_MEAN, "aim_worst": AIM_WORST, "bent_pitch": bent, "wide_pitch": wide}
         warn(log, Warning(code=Code.WEIGHTS_DIFFER, subject=camera.name, figures=figures))

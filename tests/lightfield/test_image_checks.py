@@ -307,6 +307,6 @@ def test_wrong_spacing_and_size_of_the_dots_show(small_run, tmp_path, caplog):
     assert camera.report.sigma_nor_test < GOOD
     wide, magnified = (warning.sentence for warning in camera.warnings)
     assert re.search(r"magnified 1\.(09\d|1\d\d) times, not 1", magnified)
-    assert wide.startswith("left: the board's dots look 0.") and wide.endswith("mm wide, not 0.15 mm")
+    assert wide.startswith("left: the board's dots look 0.") and "mm wide, not 0.15 mm" in wide
     right = small_run.summary["calibration"]["left"]
     assert right["magnification"] == pytest.approx(1, abs=MAGNIFICATION) and right["warnings"] == []

@@ -30,7 +30,7 @@ def dask(request, monkeypatch):
 def run(tmp_path_factory):
     """Return the folder of a run and its vectors. Tests must not change it."""
     folder = tmp_path_factory.mktemp("run")
-    return folder, write_run(folder, NUMBERS)
+    return folder, write_run(folder, NUMBERS, error_correlation_voxel=[9.1, 9.1, 8.5])
 
 
 def test_all_pairs_are_one_dataset(run, dask):
@@ -38,6 +38,7 @@ def test_all_pairs_are_one_dataset(run, dask):
     opened = lfpiv.open_results(folder)
     assert opened.pair.values.tolist() == list(NUMBERS) and (opened.chunks != {}) == dask
     assert list(opened.data_vars)[:3] == ["u", "v", "w"] and opened.attrs["dt_s"] == 1e-3
+    assert opened.attrs["error_correlation_voxel"].tolist() == [9.1, 9.1, 8.5]
     for number, vectors in written.items():
         xr.testing.assert_equal(opened.sel(pair=number, drop=True).load(), vectors)
     assert opened.valid.dtype == bool and opened.u.attrs["units"] == "m/s" and opened.x.attrs["units"] == "mm"
