@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -215,8 +215,12 @@ def check_light(
     decoder: LightFieldDecoder,
     images: Sequence[np.ndarray],
     dark: np.ndarray | None,
+    others: Callable[[], Mapping[str, LightFieldDecoder]],
 ) -> None:
-    """Refuse board images that are copies or that belong to another white image. Warn of saturation and tone curves."""
+    """Refuse board images that are copies or that belong to another white image. Warn of saturation and tone curves.
+
+    `others` returns the decoders of the other cameras, of which an image that does not fit may be.
+    """
     paths = [experiment.board_path(setup.name, plane) for plane in range(len(images))]
     first: dict[bytes, int] = {}
     saturated = np.zeros(len(images))
@@ -236,8 +240,9 @@ def check_light(
     _check_tones(f"{setup.name}, plane {plane}", images[plane])
     image = images[plane] if dark is None else images[plane] - dark
     light = gap_light(image, decoder)
-    shift = disagreement(image - np.float32(decoder.background(image)[0]), decoder, misplaced=light > NO_PLACE)
-    if light > NO_PLACE or shift is not None:
+    above = image - np.float32(decoder.background(image)[0])
+    if light > NO_PLACE or disagreement(above, decoder) is not None:
+        shift = disagreement(above, decoder, others(), misplaced=light > NO_PLACE)
         sentences = [SENTENCES[Code.MISPLACED]] if light > NO_PLACE else []
         if shift is not None:
             sentences.append((SHIFTED_LIGHT if "shift_px" in shift else OTHER_LIGHT).format(**shift) + ".")

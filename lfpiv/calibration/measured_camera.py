@@ -111,11 +111,21 @@ def measure_or_load(
     return found
 
 
+def _others(experiment: Experiment, setup: CameraSetup) -> dict[str, LightFieldDecoder]:
+    """Return the decoders of the other cameras whose white images show an array."""
+    found = {}
+    for other in experiment.cameras:
+        with contextlib.suppress(InputError):
+            if other.name != setup.name:
+                found[other.name] = decode(experiment, other).decoder
+    return found
+
+
 def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> Measured:
     sensor = decode(experiment, setup)
     step(0.2)
     dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
-    checks.check_light(experiment, setup, sensor.decoder, images, dark)
+    checks.check_light(experiment, setup, sensor.decoder, images, dark, lambda: _others(experiment, setup))
 
     known: BoardDots | None = None
 

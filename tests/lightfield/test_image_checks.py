@@ -111,6 +111,15 @@ def test_a_turned_or_refocused_array_is_told_by_its_turn_and_pitch(pair_of_camer
     assert abs(float(told[2]) / 100 * (1 if told[3] == "farther" else -1) - widening) < WIDENING
 
 
+def test_a_board_of_another_camera_is_named(pair_of_cameras, tmp_path):
+    experiment, _ = pair_of_cameras
+    folder = shutil.copytree(experiment.path.parent, tmp_path / "data")
+    shutil.rmtree(folder / "board" / "left")
+    shutil.copytree(folder / "board" / "right", folder / "board" / "left")
+    with pytest.raises(lfpiv.InputError, match=r"camera 'left'.*it fits the white image of camera right"):
+        lfpiv.calibrate(folder / experiment.path.name)
+
+
 @pytest.mark.parametrize("strength", [0.5, 1, 1.5])
 def test_rims_that_a_subtracted_background_leaves_are_no_turned_array(pair_of_cameras, strength):
     """Any turn blurs a rim to a disc, and so does the opposite turn."""
