@@ -51,9 +51,10 @@ class Runs:
         elif what == "experiment" and results is None and experiment is not None:
             self.state.p_out = self.session.places.name(experiment.parent / "results")
 
-    def start(self) -> None:
-        """Start the run that is asked for; a finished part in the folder is not repeated."""
+    def start(self, *asked: Any) -> None:
+        """Start a run with the folder and options that the page has; a finished part is not repeated."""
         session, s = self.session, self.state
+        s.p_out, s.p_pairs, s.p_workers, s.p_volumes = asked  # which a busy browser sends later than the click
         if session.edited.changed:
             raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
         given = {"--pairs": s.p_pairs, "--workers": s.p_workers}
@@ -135,7 +136,7 @@ class Runs:
                 controls.switch("p_volumes", "keep volumes")
                 controls.switch("p_stop_with_studio", "stop the run when the studio ends")
             with html.Div(classes="lf-bar"):
-                start = self.session.guarded(self.start)
+                start = (self.session.guarded(self.start), "[p_out, p_pairs, p_workers, p_volumes]")
                 controls.button("Start", start, "mdi-play", id="p-start", disabled=(running,), color="primary")
                 shown = {"pause": "p_status === 'running'", "resume": "p_status === 'paused'", "stop": running}
                 for what, when in shown.items():

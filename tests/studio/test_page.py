@@ -12,7 +12,7 @@ pytestmark = pytest.mark.browser
 FIRST_S, RUN_S = 60, 120
 """Longest time until images are decoded, and until a run has begun or ended [s]."""
 SETTLED_S = 0.5
-"""Time until a view has turned, and until the server knows a value that a script sets [s]."""
+"""Time until a view has turned [s]."""
 FOCUSED = """
 return [...document.querySelectorAll(`#${arguments[0]} :is(input, button, select, textarea, a[href], [tabindex="0"])`)]
   .filter((part) => part.offsetParent && part.tabIndex >= 0 && !part.disabled).map((part) => {
@@ -226,7 +226,6 @@ def test_a_run_is_started_and_stopped(page):
     page.open("runs")
     assert page.get("p_out") == "results"  # of the open results, as the page calls them
     page.browser.execute_script("trame.state.set('p_out', 'again')")
-    time.sleep(SETTLED_S)  # what is set by a script may come after a click
     page.click("p-start")
     until(lambda: page.get("p_status") == "running" and page.get("p_log"), RUN_S)
     page.click("p-stop")
