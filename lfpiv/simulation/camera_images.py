@@ -65,9 +65,9 @@ def render_camera(camera: SceneCamera, *, seed: int | list[int] = 0) -> render.R
 
 
 def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
-    """Return the area on the array per area of a plane of constant z, averaged over the pupil.
+    """Return the area on the array per area of a plane of constant z, averaged over the rays that reach the array.
 
-    Points have shape (n, 3) [mm], the result has shape (n,).
+    Points have shape (n, 3) [mm], the result has shape (n,); 0 for a point without such rays.
     """
     optics, points_mm = camera.optics, np.asarray(points_mm, float)
     if not camera.window and camera.aberrations is None and camera.lens is None:
@@ -80,7 +80,8 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     at, pupil = np.repeat(points_mm, len(pupil), axis=0), np.tile(pupil, (len(points_mm), 1))
     along_x, along_y = ((mapping(at + h, pupil) - mapping(at - h, pupil)) / (2 * AREA_STEP_MM) for h in step)
     area: np.ndarray = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
-    mean: np.ndarray = area.reshape(len(points_mm), -1).mean(axis=1)
+    reached = np.isfinite(area).reshape(len(points_mm), -1).sum(axis=1)
+    mean: np.ndarray = np.nan_to_num(area).reshape(len(points_mm), -1).sum(axis=1) / np.maximum(reached, 1)
     return mean
 
 

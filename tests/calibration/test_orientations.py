@@ -1,5 +1,7 @@
 """Cameras in any orientation: from above, rolled, with unlike optics; dots named by a direction, or by a mark."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import scenes
@@ -182,3 +184,17 @@ def test_a_pose_is_fitted_about_any_orientation(orientation):
     )
     fitted = plan.fitted(points, true.rays(points)[0], camera, true.rays(points)[1])
     assert abs(fitted.rotation - true.rotation).max() < 2e-3  # of the weak prior
+
+
+def test_errors_of_dots_do_not_carry_a_pose_far_from_its_plan():
+    """Aberrations displace dots by up to half a pitch. A fifth of the distance would fit these 0.1 pitch better."""
+    camera = optics()
+    plan = CameraPose.from_plan(camera, Orientation(28.0))
+    x, y, z = np.meshgrid(*[np.linspace(-1.3, 1.3, 7)] * 2, (-0.8, -0.2, 0.4))
+    points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    odd = replace(plan, parameters=(0, 0.01, 0, -0.88, -0.02, -1.66, -0.03, np.log(0.2), 0))
+    chief = odd.rays(points)[0]
+    fitted = plan.fitted(points, chief, camera)
+    misses = np.linalg.norm(fitted.rays(points)[0] - chief, axis=1) / camera.microlens_pitch_mm
+    assert np.sqrt((misses**2).mean()) < 0.15
+    assert abs(fitted.parameters[7]) < 0.1  # logarithm of the distance: twice the spread of rigs about their plans

@@ -10,7 +10,7 @@ from lfpiv.errors import InputError
 from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.simulation.lens import PRESCRIPTIONS
 from lfpiv.simulation.scene import open_scene, true_mapping
-from lfpiv.simulation.simulator import render_camera
+from lfpiv.simulation.simulator import image_area, render_camera
 from lfpiv_kernels.rendering import collect, real_optics, render
 
 TRACED_MM = 1e-10  # a path of 400 mm in float64 through eleven surfaces
@@ -18,6 +18,7 @@ POLYNOMIAL_PITCH = 1e-5  # a tenth of the 1e-4 that a calibration could notice
 REVERSED_MM = 1e-10  # iterated to 1e-12, from a pupil point a hundred times as far away
 THIN_PITCH = 1e-3  # a lens of 2 um in a beam of f/400 departs from a thin lens by its third order
 MOVED_RAYS = 3e-3  # share of the light in other pixels: float32 places these rays to 4e-4 px
+SAME_AREA = 0.1  # the magnification changes by some percent over this field and these rays
 EDGE_RAYS = 0.02  # Monte Carlo: some 10,000 rays of a dot
 
 BICONVEX = (
@@ -93,6 +94,17 @@ def test_a_thin_lens_of_surfaces_is_a_thin_lens():
     at = points(200)
     difference = true_mapping(scene_camera)(at, pupil) - true_mapping(rig(None))(at, pupil)
     assert np.abs(difference).max() < THIN_PITCH * scene_camera.optics.microlens_pitch_mm
+
+
+def test_rays_that_do_not_reach_the_array_have_no_part_in_a_dot_s_area():
+    """Towards the edge of the field a dot loses its rays one after the other; none makes its light nan."""
+    scene_camera = rig({"prescription": "cooke_triplet"})
+    at = np.column_stack([np.linspace(1, 0, 40), np.zeros(40), np.full(40, 2.0)])
+    reaches = np.isfinite(true_mapping(scene_camera)(np.repeat(at, 2, 0), np.tile([[9.0, 0], [-9, 0]], (40, 1))))
+    partly = (reaches.all(1).reshape(-1, 2).sum(1) == 1).nonzero()[0]
+    area = image_area(scene_camera, at)
+    assert len(partly) and np.isfinite(area).all() and area[-1] == 0
+    np.testing.assert_allclose(area[partly], area[0], rtol=SAME_AREA)
 
 
 def test_sources_and_boards_seen_through_a_lens_equal_their_twins(device):

@@ -369,13 +369,20 @@ def _spread_terms(pupil_radius_mm: float, order: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _cell_spectrum(basis: Basis, step_mm: float) -> np.ndarray:
-    """Return the transform of each table element's share in the Voronoi cell of a lens at the table's origin."""
+    """Return the transform of the Voronoi cell of a lens at the table's origin, as linear interpolation wants it.
+
+    The raster takes means over table elements, and reading between elements smooths once more by a triangle. Their
+    transforms are divided out.
+    """
     fine = (np.arange(TABLE * _RASTER) + 0.5 - (TABLE + 1) * _RASTER / 2) * step_mm / _RASTER
-    inside = np.ones((fine.size, fine.size), bool)
+    inside = np.ones((fine.size, fine.size))
     for vector in _neighbours(basis):
-        inside &= fine[:, None] * vector[0] + fine[None] * vector[1] < vector @ vector / 2
+        size = np.hypot(*vector)
+        beyond = fine[:, None] * vector[0] / size + fine * vector[1] / size - size / 2
+        inside *= np.clip(0.5 - beyond * _RASTER / step_mm, 0, 1)  # part of a sample within the cell
     share = inside.reshape(TABLE, _RASTER, TABLE, _RASTER).mean((1, 3))
-    spectrum: np.ndarray = fft.rfft2(fft.ifftshift(share))
+    smooth = np.sinc(fft.fftfreq(TABLE))[:, None] * np.sinc(fft.rfftfreq(TABLE))
+    spectrum: np.ndarray = fft.rfft2(fft.ifftshift(share)) / smooth**3
     return spectrum
 
 

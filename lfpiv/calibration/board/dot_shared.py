@@ -26,6 +26,7 @@ from lfpiv.calibration.board.dot_model import (
     ray_terms,
 )
 from lfpiv.calibration.board.dots import ExpectedDot
+from lfpiv.calibration.board.pupil_zones import INNER
 from lfpiv.geometry.optics import spread_over_pupil
 from lfpiv.lightfield.decoder import NORMAL_MAD
 from lfpiv.warn import Code, Warning, warn
@@ -192,6 +193,37 @@ def estimate_bend(shared: SharedParameters, fits: Sequence[DotFit | None], pitch
         text = "aberrations bend rays at the rim of the main lens by %.2g microlens pitches (rms)"
         log.info(text, _edge(bend) / pitch_mm)
     return replace(shared, bend_mm=bend)
+
+
+def labels_spread(shared: SharedParameters, fits: Sequence[DotFit | None], pitch_mm: float) -> float:
+    """Return the mean error of labels that errors of the shared parameters make [mm], within `INNER` of the pupil.
+
+    It is common to all labels, so they do not show it among themselves. The scatter of the dots' pulls, which includes
+    errors of their model, gives the errors of the parameters [1]_. `fits` as `estimate_bend` takes them; a bend that
+    they do not show has no error.
+
+    References
+    ----------
+    .. [1] H. White, "Maximum likelihood estimation of misspecified models", Econometrica 50 (1982) 1-25,
+       doi:10.2307/1912526.
+    """
+    sure, typical = _typical(fits)
+    if len(sure) < 2:
+        return 0.0
+    each, own = (shared.bend_mm.size // 2) * bool(shared.bend_mm.any()), slice(TERMS)
+    free = 2 + 2 * each
+    information = np.stack([fit.pull_information[:free, :free] for fit in sure]) / typical
+    pull = np.stack([fit.pull[:free] for fit in sure]) / typical
+    prior = np.append(1 / np.square(_SIZE_PRIOR), np.full(2 * each, (_BEND_PRIOR_PITCHES * pitch_mm) ** -2))
+    inverse = np.linalg.inv(information.sum(0) + np.diag(prior))
+    miss = (pull - information @ (inverse @ pull.sum(0))) @ inverse
+    terms = ray_terms(INNER * spread_over_pupil(1.0), 1.0, shared.order)
+    following = np.stack([fit.following[:, :free].reshape(2, TERMS, free) for fit in sure])
+    moved = terms[:, own] @ following  # of the rays of each dot, shape (dots, 2, rays, free)
+    for axis in range(2):
+        moved[:, axis, :, 2 + axis * each : 2 + (axis + 1) * each] += terms[:, TERMS : TERMS + each]
+    square = np.einsum("darn,nm,darm->", moved, miss.T @ miss, moved) / (len(moved) * len(terms))
+    return float(np.sqrt(np.pi / 4 * square * len(sure) / (len(sure) - 1)))
 
 
 def _common_bend(

@@ -170,7 +170,8 @@ class Labels:
     shape (PARTS, ZONES, 2); zero where they show none, and for the Gaussian estimator."""
     shared_error_mm: float
     """Error that the labels of all dots share, so that no comparison of labels shows it, mean within 0.9 of the pupil's
-    radius [mm]: what their pixels show beside the form of their rays. 0 for the Gaussian estimator."""
+    radius [mm]: what their pixels show beside the form of their rays, and errors of diameter, blur and bend. 0 for the
+    Gaussian estimator."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

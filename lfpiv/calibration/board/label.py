@@ -10,13 +10,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lfpiv.calibration.board.dot_fit import FEWEST_PIXELS, BoardPixels, DotFit, converged, fit_dots
 from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, ray_terms, slope_of
-from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, estimate_shared, follow_bend
+from lfpiv.calibration.board.dot_shared import (
+    estimate_bend,
+    estimate_pixels,
+    estimate_shared,
+    follow_bend,
+    labels_spread,
+)
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard, Labels, expect_dots
 from lfpiv.calibration.board.planes import Signals
 from lfpiv.calibration.board.pose import CameraPose
@@ -60,6 +66,7 @@ def label_by_integral(signals: Signals, decoder: LightFieldDecoder, board: DotBo
     shared = estimate_shared(pixels, expected, board.diameter_mm, margin)
     fits = fit_dots(LensIntegral(optics, decoder.lattice, shared), pixels, expected, margin)
     bent = estimate_bend(shared, fits, pitch)
+    spread_mm = labels_spread(bent, fits, pitch)
     fits = follow_bend(fits, bent.bend_mm - shared.bend_mm)
 
     pixels = estimate_pixels(pixels, fits)
@@ -70,7 +77,8 @@ def label_by_integral(signals: Signals, decoder: LightFieldDecoder, board: DotBo
     trusted = _trusted(fits, prior, board, pitch, detection.sign)
     rejected = prior.dot[np.isin(prior.dot, detection.dot) & ~trusted]
     measured = {int(dot): fit for dot, fit, sure in zip(prior.dot, fits, trusted, strict=True) if sure and fit}
-    return _sample(measured, rejected, model, pixels.response_share)
+    labels = _sample(measured, rejected, model, pixels.response_share)
+    return replace(labels, shared_error_mm=float(np.hypot(labels.shared_error_mm, spread_mm)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

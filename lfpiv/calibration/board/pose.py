@@ -23,6 +23,7 @@ BIN_PITCHES = 0.35
 _PRIOR = {"angle_deg": 7.0, "tilt_deg": 3.0, "offset_mm": 0.7, "relative": 0.05}  # spread of rigs about their plans
 _DEPTH_PRIOR = 0.3  # spread of the logarithm of the apparent depth behind a liquid: from 0.5 (oil, 45 degrees) to 1
 _ROBUST_PITCHES = 0.5  # dots that miss the pose by more have less weight
+_BLOB_PITCHES = 0.15  # accuracy of a dot in a rectified image, against which the plan weighs
 _USED_COVERAGE = 0.9
 _PIXELS_ACROSS = 8  # pixels across a microimage that suffice to find dots
 _SIGNIFICANT = 6.0  # least contrast of a dot in a rectified image [standard deviations]
@@ -132,10 +133,11 @@ class CameraPose:
         sigma = np.array([angle, tilt, tilt] + 3 * [_PRIOR["offset_mm"]] + 3 * [_PRIOR["relative"]] + [_DEPTH_PRIOR])
         sigma = sigma[: len(self.parameters)]
         accuracy = _ROBUST_PITCHES * optics.microlens_pitch_mm
+        plan = _BLOB_PITCHES / _ROBUST_PITCHES / sigma
 
         def residuals(parameters: np.ndarray) -> np.ndarray:
             chief, k = replace(self, parameters=tuple(parameters)).rays(points_mm)
-            misses = [((chief - array_mm) / accuracy).ravel(), 0.1 * parameters / sigma]
+            misses = [((chief - array_mm) / accuracy).ravel(), plan * parameters]
             if slope is not None:
                 misses.append((k - slope) * optics.pupil_radius_mm / accuracy)
             return np.concatenate(misses)
