@@ -160,7 +160,7 @@ class Preview:
             self.session.start(self._plan())
 
     async def _plan(self) -> None:
-        command = ["-m", "lfpiv", "plan", str(self.session.experiment), "--quiet"]
+        command = ["-m", "lfpiv", "plan", str(self.session.experiment)]
         if self.session.results is not None and self.session.results.is_dir():
             command += ["--out", str(self.session.results)]
         with self.session.busy("t_busy", "doing the first pair, whose times are scaled"):
@@ -184,7 +184,7 @@ class Preview:
                 with html.Div(classes="lf-buttons"):
                     controls.button("Try", guarded(self.try_it), "mdi-play", id="t-try", disabled=("!!t_busy",))
                     controls.button("Write into the form", guarded(self.keep), id="t-keep")
-                    controls.button("Cost of the campaign", guarded(self.plan), disabled=("!!t_busy",))
+                    controls.button("Cost of the campaign", guarded(self.plan), id="t-plan", disabled=("!!t_busy",))
                 html.Div("{{ line }}", v_for="line in t_plan", key="line", classes="lf-note")
                 html.Div(
                     "Try measures a pair by correlation on longer voxels: fast, and less accurate than a run. Change a "

@@ -199,6 +199,12 @@ def test_sliders_that_were_moved_alone_reach_the_form(page):
     until(lambda: not page.get("x_changed"))
 
 
+def test_the_cost_of_the_campaign_is_told(page):
+    page.open("preview")
+    page.click("t-plan")
+    until(lambda: any(line.strip().startswith("in all") for line in page.get("t_plan")), RUN_S)
+
+
 def test_a_series_plays_and_stops(page):
     page.open("results")
     page.click("r-play")
