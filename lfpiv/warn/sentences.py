@@ -180,8 +180,8 @@ SENTENCES: Mapping[Code, str] = {
         '"horizontal" if they show the scene as it is seen, "none" if they are mirrored'
     ),
     Code.PLANE_EMPTY: (
-        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image; the "
-        "calibration does not use it."
+        "no dot was found in plane {plane} of the board (z = {z_mm:g} mm), {path}: look at the image, and check that "
+        "place in board.planes_mm; the calibration does not use it."
     ),
     Code.PLANE_LEFT_OUT: (
         "{left_out} of {seen} dots of plane {plane} of the board (z = {z_mm:g} mm) do not fit the others and are "
