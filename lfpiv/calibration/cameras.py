@@ -300,7 +300,7 @@ def _fit_mapping(
         chosen = train_several(trained, region_mm, radius, seed=settings.seed, unit=pitch_mm)
         halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed) / pitch_mm
     training, inputs = chosen.training, np.hstack([points, pupil])
-    chance = max(chosen.scatter, training.sigma_nor if math.isnan(halves) else halves)
+    chance = max(chosen.error, training.sigma_nor if math.isnan(halves) else halves)
     unfollowed = smooth_departure(inputs, target - training.network(inputs), dots.dot[agreeing]) / pitch_mm
     held_out = training.split.test
     held = stated_mm[agreeing][held_out], pupil[held_out]

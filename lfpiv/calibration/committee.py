@@ -2,9 +2,9 @@
 
 A network whose first weights or split were unlucky can leave the true mapping between the dots or at the border of the
 board, where no held-out dot shows it. Such errors differ from network to network. So the network nearest to the others
-is taken, and its distance to them is an estimate of its error [1]_. What the noise of the labels makes, all of them
-share in part. So two mappings are fitted as well, each to half of the dots: half of their distance is the error of a
-mapping that is fitted to all dots [2]_.
+is taken. Its distance to the median of all, and what that median is uncertain by, estimate its error [1]_. What the
+noise of the labels makes, all of them share in part. So two mappings are fitted as well, each to half of the dots: half
+of their distance is the error of a mapping that is fitted to all dots [2]_.
 
 References
 ----------
@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 NETWORKS, MOST_NETWORKS = 3, 7
 """Least and largest number of networks that are trained for a camera. Two networks are equally far from each other, so
 one that is wrong shows among three. More are trained while they scatter by more than the held-out dots show."""
+OF_MEDIAN = math.sqrt(math.pi / 2)
+"""Standard error of a median over that of a mean, for normal errors."""
 RAYS = 2000
 """Rays on which networks are compared."""
 FEWEST_DOTS = 40
@@ -50,8 +53,10 @@ class Chosen:
     training: Training
     """The network, as it was trained."""
     scatter: float
-    """Error that the chance of the training makes. It is the median distance to the other networks over the square root
-    of 2, since both ends of a distance have errors. A few networks that are far off do not change a median."""
+    """Typical error of a network by chance. It is the median distance to the other networks over the square root of 2,
+    since both ends of a distance have errors. A few networks that are far off do not change a median."""
+    error: float
+    """Error of this network by chance: its distance to the median of all, and the standard error of that median."""
 
 
 def train_several(
@@ -73,7 +78,7 @@ def train_several(
     Returns
     -------
     Chosen
-        With the time of all trainings, and the scatter in multiples of `unit`.
+        With the time of all trainings, and the errors in multiples of `unit`.
     """
     trainings = [train(seed + number) for number in range(NETWORKS)]
     found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
@@ -85,7 +90,7 @@ def train_several(
         "network %d of %d is nearest to the others, which scatter by %.2g mm", number, len(trainings), found.scatter
     )
     training = replace(found.training, seconds=sum(one.seconds for one in trainings))
-    return Chosen(training=training, scatter=found.scatter / unit)
+    return Chosen(training=training, scatter=found.scatter / unit, error=found.error / unit)
 
 
 def nearest_to_others(
@@ -107,7 +112,7 @@ def nearest_to_others(
     Returns
     -------
     Chosen
-        An element of `trainings`, and the scatter in the unit of the networks' outputs.
+        An element of `trainings`, and the errors in the unit of the networks' outputs.
     """
     rng, (low, high) = np.random.default_rng(seed), region_mm
     rays = np.hstack([rng.uniform(low, high, (RAYS, 3)), random_on_pupil(pupil_radius_mm, RAYS, rng)])
@@ -115,7 +120,9 @@ def nearest_to_others(
     between = np.linalg.norm(mapped[:, None] - mapped, axis=-1).mean(-1)  # distance of each two networks, over the rays
     distances = np.median(np.sort(between, axis=1)[:, 1:], axis=1)  # less the distance to itself, which is 0
     best = int(distances.argmin())
-    return Chosen(training=trainings[best], scatter=float(distances[best] / np.sqrt(2)))
+    scatter, apart = float(distances[best] / np.sqrt(2)), mapped[best] - np.median(mapped, axis=0)
+    error = math.hypot(np.linalg.norm(apart, axis=1).mean(), OF_MEDIAN * scatter / math.sqrt(len(trainings)))
+    return Chosen(training=trainings[best], scatter=scatter, error=error)
 
 
 def distance_of_halves(

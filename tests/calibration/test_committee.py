@@ -19,6 +19,8 @@ from lfpiv.geometry.optics import random_on_pupil
 REGION_MM, PUPIL_MM = np.array([[-2.0, -2, -1], [2, 2, 1]]), 12.5
 BORDER_MM = 0.3  # error of a network at one border, where no sample shows it
 LENGTH_MM = 1e4  # unit in which errors are far below 1, so that no further network is trained
+DRAWS = 200
+CHOSEN_SHARE = 0.35  # relative: 0.18 with three networks over 4000 draws, of 200 draws 0.1 by chance
 SHIFT_MM = 0.004  # of a network, along one output, against two equal ones
 
 
@@ -58,6 +60,20 @@ def test_the_scatter_is_the_error_of_a_network(trainings):
     errors = [np.linalg.norm(one.network(rays) - places(rays), axis=1).mean() for one in trainings]
     found = nearest_to_others(trainings, REGION_MM, PUPIL_MM, seed=0).scatter
     assert min(errors) / 2 < found < 2 * max(errors)  # three networks tell a mean error within a factor of two
+
+
+@pytest.mark.parametrize("count", [NETWORKS, MOST_NETWORKS])
+def test_the_error_of_the_chosen_network_is_stated(trainings, count):
+    """Errors of networks have long tails: Student's distribution, 2 degrees of freedom."""
+    random, found = np.random.default_rng(9), []
+    for draw in range(DRAWS):
+        errors = SHIFT_MM * random.standard_t(2, (count, 2))
+        several = [shifted(trainings[0], error) for error in errors]
+        chosen = nearest_to_others(several, REGION_MM, PUPIL_MM, seed=draw)
+        own = next(np.linalg.norm(e) for one, e in zip(several, errors, strict=True) if one is chosen.training)
+        found.append((chosen.error, own))
+    stated, true = np.median(found, axis=0)
+    assert abs(stated / true - 1) < CHOSEN_SHARE
 
 
 @pytest.mark.parametrize(("apart_mm", "expected"), [(0.0, NETWORKS), (BORDER_MM, MOST_NETWORKS)])
