@@ -100,5 +100,5 @@ def test_tracks_of_a_series(series, stored, loops):
     expected = np.array(DISPLACEMENT_VOXEL) * VOXEL_MM / 1000 / DT_S
     np.testing.assert_allclose(speed.mean(axis=0), expected, atol=BIAS * VOXEL_MM / 1000 / DT_S)
     found = {name: tracks[name].values for name in ("instant", "x", "u", "valid")}
-    found["lengths"] = np.bincount(tracks.track.values)  # numbers of tracks grow along the list, and so would their norm
+    found["lengths"] = np.bincount(tracks.track.values)  # the numbers themselves grow along the list
     stored.check("series: tracks", loops, found, listed=True)

@@ -30,6 +30,7 @@ _ROBUST_SIGMA = 4.0  # residuals beyond this count linearly [standard deviations
 _MODEL_ERROR = 0.01  # share of the light that white image and dot shape leave unexplained
 _ITERATIONS = 25
 _STEP_SIGMA = 0.02  # a fit has converged when no parameter moves by more [standard errors]
+_CYCLE_SIGMA = 0.5  # and when it moves to and fro by less after all iterations, as the weights follow it
 _LARGEST_DAMPING = 1e8
 
 _RAYS = 2 * TERMS  # ray coefficients of a dot
@@ -311,7 +312,8 @@ class _Problem:
 class _Step:
     state: _State
     damping: float
-    converged: bool
+    moved: float
+    """Largest change of a parameter [standard errors]; 0 where no step lowers the cost."""
 
 
 def _fit_dot(problem: _Problem, before: DotFit | None) -> DotFit | None:
@@ -322,7 +324,7 @@ def _fit_dot(problem: _Problem, before: DotFit | None) -> DotFit | None:
     oldest = _TABLE_AGE * problem.model.cell_reach_mm.min()
     first = before.coefficients if before is not None and before.converged else problem.dot.theta
     slope, table = slope_of(first, radius), problem.table(first)
-    step = _Step(problem.state(first, table, None), 1e-3, False)
+    step = _Step(problem.state(first, table, None), 1e-3, np.inf)
     for _ in range(_ITERATIONS):
         state = step.state
         if not problem.lights_enough(state):
@@ -331,9 +333,9 @@ def _fit_dot(problem: _Problem, before: DotFit | None) -> DotFit | None:
             slope, table = slope_of(state.theta, radius), problem.table(state.theta)
             state = problem.state(state.theta, table, state.linear)
         step = _improve(problem, state, table, step.damping)
-        if step.converged:
+        if step.moved < _STEP_SIGMA:
             break
-    return _summarise(problem, step.state, step.converged and problem.lights_enough(step.state))
+    return _summarise(problem, step.state, step.moved < _CYCLE_SIGMA and problem.lights_enough(step.state))
 
 
 def _improve(problem: _Problem, state: _State, table: LensTable, damping: float) -> _Step:
@@ -346,11 +348,11 @@ def _improve(problem: _Problem, state: _State, table: LensTable, damping: float)
         step = np.linalg.solve(normal + np.diag(damping * diagonal), gradient)
         theta = state.theta + step[:_RAYS].reshape(2, TERMS).T
         trial = problem.state(theta, table, state.linear + step[_RAYS:])
-        small = bool(np.all(np.abs(step) < _STEP_SIGMA / np.sqrt(diagonal)))
+        moved = float((np.abs(step) * np.sqrt(diagonal)).max())
         if problem.cost(trial, weight) <= cost:
-            return _Step(trial, max(damping / 10, 1e-9), small)
-        if small or damping > _LARGEST_DAMPING:
-            return _Step(state, damping, True)
+            return _Step(trial, max(damping / 10, 1e-9), moved)
+        if moved < _STEP_SIGMA or damping > _LARGEST_DAMPING:
+            return _Step(state, damping, 0.0)
         damping *= 10
 
 
