@@ -125,5 +125,5 @@ def belongs(experiment: Path, results: Path) -> bool:
         stated = Path(read_object(read_text(Folder(results).summary))["experiment"]["file"])
     except (OSError, RecordError, KeyError, TypeError):
         return near
-    named = len(stated.parts) > 1 and str(experiment).endswith(str(stated))
+    named = len(stated.parts) > 1 and experiment.parts[-len(stated.parts) :] == stated.parts
     return named or (near and stated.name == experiment.name)

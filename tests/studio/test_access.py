@@ -67,7 +67,7 @@ def test_results_belong_to_the_experiment_file_that_their_summary_names(tmp_path
     results.mkdir(parents=True)
     if stated is not None:
         (results / "summary.json").write_text(json.dumps({"experiment": {"file": stated}}), "utf-8")
-    files = ("rig/a.toml", "rig/b.toml", "away/a.toml")
+    files = ("rig/a.toml", "rig/b.toml", "away/a.toml", "faraway/a.toml")
     assert {file for file in files if belongs(tmp_path / file, results)} == found
 
 

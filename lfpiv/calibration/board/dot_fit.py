@@ -30,7 +30,7 @@ _ROBUST_SIGMA = 4.0  # residuals beyond this count linearly [standard deviations
 _MODEL_ERROR = 0.01  # share of the light that white image and dot shape leave unexplained
 _ITERATIONS = 25
 _STEP_SIGMA = 0.02  # a fit has converged when no parameter moves by more [standard errors]
-_CYCLE_SIGMA = 0.5  # and when it moves to and fro by less after all iterations, as the weights follow it
+_CYCLE_SIGMA = 0.5  # a fit that still moves by less after all iterations swings between two weightings; it is kept
 _LARGEST_DAMPING = 1e8
 
 _RAYS = 2 * TERMS  # ray coefficients of a dot
