@@ -77,7 +77,7 @@ def see(driver: webdriver.Chrome, address: str) -> None:
                     if tab == "preview":  # and once more, changed
                         driver.execute_script("trame.state.set('t_correlation_overlap', 0.5)")
                         click(driver, button)
-                        wait(driver, "return trame.state.get('t_before') !== trame.state.get('t_after')")
+                        wait(driver, "return !!trame.state.get('t_before')")
                 time.sleep(SETTLED_S)
                 driver.save_screenshot(str(OUT / f"{tab}_{size}_{theme}.png"))
 

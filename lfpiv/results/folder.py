@@ -252,7 +252,7 @@ def _open_lock(path: Path) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Holder:
+class Holder:
     """Content of a lock file."""
 
     process: int
@@ -263,7 +263,7 @@ class _Holder:
 def _process_name(holder: bytes) -> str:
     """Return the process that holds a lock, from the content of the lock file."""
     try:
-        found = validate(_Holder, read_object(holder))
+        found = validate(Holder, read_object(holder))
     except RecordError:  # the holder has not written its name yet
         return "another process"
     return f"process {found.process} on {found.host[:80]} since {found.since[:40]}"

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import os
-import secrets
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -28,38 +28,35 @@ MOST_BYTES = 200_000
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-@dataclass(frozen=True)
-class Token:
-    """A random word that the address of the page holds; a cookie keeps it afterwards."""
+def guard(token: str) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
+    """Return what refuses requests without the token, by other names of this machine, or from other pages.
 
-    word: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+    The address of the page holds the token; a cookie keeps it afterwards.
+    """
 
-    def middleware(self) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
-        """Return what refuses requests without the token, by other names of this machine, or from other pages."""
+    @web.middleware
+    async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
+        host = urlsplit(f"//{request.headers.get('Host', '')}")
+        origin = request.headers.get("Origin")
+        if host.hostname not in HOSTS or (origin and urlsplit(origin).netloc != host.netloc):
+            raise web.HTTPForbidden(text="lfpiv studio answers its own page only.")
+        name, asked = f"lfpiv_{host.port}", request.query.get("token", "")
+        known = (asked, request.cookies.get(name, ""))
+        if not any(hmac.compare_digest(word.encode(), token.encode()) for word in known):
+            raise web.HTTPForbidden(text="Open the address that lfpiv studio printed; it holds a token.")
+        try:
+            response = await handler(request)
+        except web.HTTPException as error:
+            response = error
+        except ConnectionError:  # the page was closed while something was sent to it
+            response = web.Response()
+        if not response.prepared:
+            response.headers["Referrer-Policy"] = "no-referrer"
+            if asked:
+                response.set_cookie(name, token, httponly=True, samesite="Strict")
+        return response
 
-        @web.middleware
-        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-            host = urlsplit(f"//{request.headers.get('Host', '')}")
-            origin = request.headers.get("Origin")
-            if host.hostname not in HOSTS or (origin and urlsplit(origin).netloc != host.netloc):
-                raise web.HTTPForbidden(text="lfpiv studio answers its own page only.")
-            name, asked = f"lfpiv_{host.port}", request.query.get("token", "")
-            known = (asked, request.cookies.get(name, ""))
-            if not any(hmac.compare_digest(word.encode(), self.word.encode()) for word in known):
-                raise web.HTTPForbidden(text="Open the address that lfpiv studio printed; it holds a token.")
-            try:
-                response = await handler(request)
-            except web.HTTPException as error:
-                response = error
-            except ConnectionError:  # the page was closed while something was sent to it
-                response = web.Response()
-            if not response.prepared:
-                response.headers["Referrer-Policy"] = "no-referrer"
-                if asked:
-                    response.set_cookie(name, self.word, httponly=True, samesite="Strict")
-            return response
-
-        return guard
+    return guarded
 
 
 @dataclass(frozen=True)
@@ -99,13 +96,10 @@ class Places:
         found = []
         for folder in self.folders():
             for path in sorted(folder.glob("*.toml"))[:50]:
-                try:
-                    with open_regular(path) as file:
-                        text = file.read(MOST_BYTES).decode("utf-8", errors="replace")
-                except (OSError, RecordError):
-                    continue
-                if "[[camera]]" in text and "[volume]" in text and "white_image" in text:
-                    found.append(path)
+                with contextlib.suppress(OSError, RecordError), open_regular(path) as file:
+                    text = file.read(MOST_BYTES).decode("utf-8", errors="replace")
+                    if all(part in text for part in ("[[camera]]", "[volume]", "white_image")):
+                        found.append(path)
         return found
 
     def results(self) -> list[Path]:

@@ -49,10 +49,7 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
 
 def _drawn(window: Any, ratio: float, quality: int) -> bytes:
     """Render a window at a part of its size, letters included, and return it as JPEG."""
-    if ratio == 1:
-        window.Render()
-        return _encoded(window, quality)
-    size, letters = tuple(window.GetSize()), window.GetDPI()
+    size, letters, picture = tuple(window.GetSize()), window.GetDPI(), b""
     props = [prop for renderer in window.GetRenderers() for prop in renderer.GetViewProps()]
     axes = [(prop, prop.GetScreenSize()) for prop in props if prop.IsA("vtkCubeAxesActor")]
     for share in (ratio, 1.0):
@@ -60,7 +57,7 @@ def _drawn(window: Any, ratio: float, quality: int) -> bytes:
         window.SetDPI(round(share * letters))
         for prop, height in axes:
             prop.SetScreenSize(share * height)
-        if share < 1:
+        if not picture:
             window.Render()
             picture = _encoded(window, quality)
     return picture

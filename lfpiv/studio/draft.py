@@ -71,17 +71,14 @@ class Draft:
     def set(self, location: Sequence[int | str], value: Any) -> None:
         """Replace a value, or remove the key for None. A missing table is added at the end of the file."""
         table: Any = self.document
+        if value is None and self.get(location) is None:
+            return
         for part in location[:-1]:
-            if isinstance(part, str) and part not in table:
-                if value is None:
-                    return
-                table[part] = tomlkit.table()
-            table = table[part]
-        key = location[-1]
+            table = table.setdefault(part, tomlkit.table()) if isinstance(part, str) else table[part]
         if value is None:
-            table.pop(key, None)
+            del table[location[-1]]
         else:
-            table[key] = value
+            table[location[-1]] = value
 
     def write(self, location: Sequence[int | str], text: str, plain: bool) -> None:
         """Replace a value by a text that a person typed: TOML, or words without quotes; nothing removes the key."""
@@ -155,7 +152,8 @@ class Draft:
             if name == "volume":
                 for number, solid in enumerate(self.values.get("volume", {}).get("solid", [])):
                     shape = HalfSpace if solid.get("kind") == "half_space" else Box
-                    found.append(self._form(f"volume.solid.{number}", shape, f"solid {number}: {shape.__name__}"))
+                    kind = str(solid.get("kind")).replace("_", " ")
+                    found.append(self._form(f"volume.solid.{number}", shape, f"solid {number}: {kind}"))
         return found
 
     def _form(self, path: str, model: type[BaseModel], title: str) -> dict[str, Any]:
@@ -188,11 +186,9 @@ def _rows(model: type[BaseModel]) -> tuple[dict[str, Any], ...]:
     """Return what a form needs of the keys of a table."""
     properties = model.model_json_schema()["properties"]
     rows = []
-    for key, allowed, default, meaning in key_rows(model):
-        entry = properties[key]
-        options = entry.get("enum") or (["true", "false"] if entry.get("type") == "boolean" else [])
-        row = {"key": key, "unit": unit_of(key), "allowed": allowed.replace("`", ""), "default": default.strip("`")}
-        rows.append(
-            row | {"meaning": meaning.replace("`", ""), "options": options, "plain": entry.get("type") == "string"}
-        )
+    for key, *words in key_rows(model):
+        kind, choices = properties[key].get("type"), properties[key].get("enum")
+        options = choices or (["true", "false"] if kind == "boolean" else [])
+        told = dict(zip(("allowed", "default", "meaning"), (text.replace("`", "") for text in words), strict=True))
+        rows.append({"key": key, "unit": unit_of(key), "options": options, "plain": kind == "string", **told})
     return tuple(rows)

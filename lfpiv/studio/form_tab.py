@@ -26,9 +26,7 @@ class Form:
         self.session, self.state = session, session.state
         self.state.update({"x_tables": [], "x_texts": {}, "x_wrong": {}, "x_elsewhere": [], "x_files": []})
         self.state.update({"x_shown": [0], "x_changed": False, "x_diff": "", "x_checked": ""})
-        self.state.change("x_open")(
-            lambda x_open, **_: x_open and session.guarded(session.choose)("experiment", x_open)
-        )
+        session.on_change(lambda: session.choose(self.state.experiment_open), "experiment_open")
         self.plain: set[str] = set()
         session.server.trigger("x_write")(session.guarded(self.write))
         session.listeners.append(self._changed)
@@ -40,7 +38,6 @@ class Form:
         if what == "experiment":
             places, session.draft = session.places, None
             s.x_files = [{"title": places.name(path), "value": str(path)} for path in places.experiments()]
-            s.x_open = str(session.experiment or "")
             self._show(anew=True)
             try:
                 session.draft = Draft(session.experiment) if session.experiment is not None else None
@@ -108,7 +105,7 @@ class Form:
         edit = self.session.guarded(self.edit)
         with html.Div(classes="lf-form"):
             with html.Div(classes="lf-bar"):
-                controls.choice("x_open", "experiment file", ("x_files",), id="x-open", classes="lf-wide")
+                controls.choice("experiment_open", "experiment file", ("x_files",), id="x-open", classes="lf-wide")
                 controls.button("Save", (edit, "['save']"), "mdi-content-save", disabled=("!x_changed",), id="x-save")
                 controls.button("Undo all", (edit, "['undo']"), disabled=("!x_changed",), id="x-undo")
                 controls.button("Add a camera", (edit, "['camera']"), "mdi-camera-plus")
@@ -120,9 +117,8 @@ class Form:
                     with v3.VExpansionPanelTitle():
                         html.Span("{{ table.title }}")
                         wrong = "table.rows.filter((row) => x_wrong[row.id]).length"
-                        v3.VChip(
-                            f"{{{{ {wrong} }}}} to mend", v_if=wrong, color="error", size="x-small", classes="ml-2"
-                        )
+                        said = f"{{{{ {wrong} }}}} to mend"
+                        v3.VChip(said, v_if=wrong, color="error", size="x-small", classes="ml-2")
                     with v3.VExpansionPanelText():
                         self._table(edit)
             html.H3("What will be written", v_if="x_changed")
@@ -145,8 +141,7 @@ class Form:
                 v_else=True, input=WRITE,
                 raw_attrs=[
                     ":id=\"'x-' + row.id\"", ':value="x_texts[row.id]"', ':placeholder="row.default"',
-                    'spellcheck="false"',
-                    ":aria-invalid=\"x_wrong[row.id] ? 'true' : 'false'\"",
+                    'spellcheck="false"', ":aria-invalid=\"x_wrong[row.id] ? 'true' : 'false'\"",
                 ],
             )  # fmt: skip
             html.Div("{{ x_wrong[row.id] }}", v_if="x_wrong[row.id]", classes="lf-wrong", role="alert")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ class Picture(AbstractElement):  # type: ignore[misc]  # trame has no types
     def __init__(self, **options: Any) -> None:
         super().__init__("lf-image", **options)
         self._attr_names += ["image", "low", "high", "marks", "name", "smooth", "region"]
-        self._event_names += ["point", "pick"]
+        self._event_names += ["point"]
 
 
 class Images:
@@ -34,36 +35,33 @@ class Images:
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
         self.raw: RawImages | None = None
-        self.state.update(
-            {
-                "i_cameras": [], "i_names": [], "i_image": None, "i_top": 1.0, "i_marks": [], "i_facts": [],
-                "i_chart": "", "i_radius": 1.0, "i_pupil": None, "i_pupil_high": 1.0, "i_depth": [-1.0, 1.0],
-                "i_plane": None, "i_busy": "", "i_source": "", "i_place": None, "i_region": [],
-            }
-        )  # fmt: skip
-        change = self.state.change
-        change("tab")(lambda **_: self._open())
-        change("i_place")(lambda **_: session.guarded(self._go)())
-        change("i_camera", "i_name")(lambda **_: self._show())
-        change("i_lattice", "i_dots", "i_pixels", "i_axes")(lambda **_: session.guarded(self._mark)())
-        change("i_u", "i_v")(lambda **_: session.guarded(self._pupil)())
-        change("i_z", "i_both")(lambda **_: session.guarded(self._refocus)())
+        self.shown: tuple[RawImages, str, str] | None = None
+        self.state.update({
+            "i_cameras": [], "i_names": [], "i_image": None, "i_top": 1.0, "i_marks": [], "i_facts": [],
+            "i_chart": "", "i_radius": 1.0, "i_pupil": None, "i_pupil_high": 1.0, "i_depth": [-1.0, 1.0],
+            "i_plane": None, "i_busy": "", "i_source": "", "i_place": None, "i_region": [],
+        })  # fmt: skip
+        session.on_change(self._open, "tab")
+        session.on_change(self._go, "i_place")
+        session.on_change(self._show, "i_camera", "i_name")
+        changing = {self._mark: "lattice dots pixels axes", self._pupil: "u v", self._refocus: "z both"}
+        for draw, names in changing.items():
+            session.on_change(partial(self._draw, draw), *(f"i_{name}" for name in names.split()))
         session.listeners.append(self._changed)
         self._panel()
 
-    def _changed(self, what: str) -> None:
+    def _changed(self, what: str) -> Any:
         """Forget what belongs to an experiment or a run that was open before."""
         if what in ("experiment", "results", "saved"):
-            self.raw = None
-            self._open()
+            self.raw = self.state.i_image = self.state.i_pupil = self.state.i_plane = None
+            return self._open()
+        return None
 
-    def _open(self) -> None:
-        path = self.session.experiment if self.state.tab == "images" else None
-        if path is not None and self.raw is None and not self.state.i_busy:
-            self.session.start(self._open_aside(path))
-
-    async def _open_aside(self, path: Path) -> None:
+    async def _open(self) -> None:
         """Read the experiment beside the page."""
+        path = self.session.experiment
+        if path is None or self.raw is not None or self.state.tab != "images" or self.state.i_busy:
+            return
         with self.session.busy("i_busy", "reading the experiment"):
             self.raw = raw = RawImages(await asyncio.to_thread(read_experiment, path), self.session.results)
         with self.state as s:
@@ -73,15 +71,7 @@ class Images:
             half = grid.shape[0] * grid.voxel_mm / 2
             s.i_depth, s.i_z = [z - half, z + half], z
             self._go()
-            self._show()
-
-    def _show(self) -> None:
-        """List the images of the camera, and show the chosen one."""
-        raw, s = self.raw, self.state
-        if raw is not None and s.i_camera:
-            s.i_names = raw.names(s.i_camera)
-            s.i_name = s.i_name if s.i_name in s.i_names else s.i_names[0]
-            self.session.start(self._show_aside(raw, s.i_camera, s.i_name))
+        await self._show()
 
     def _go(self) -> None:
         """Show the camera, the image and the region that a warning names, as soon as the experiment is read."""
@@ -95,8 +85,17 @@ class Images:
         found = raw.recorded_px(s.i_camera, corners) if len(corners) else corners
         s.i_region = [*found.min(0).tolist(), *found.max(0).tolist()] if len(found) else []
 
-    async def _show_aside(self, raw: RawImages, camera: str, name: str) -> None:
-        """Show an image at once, and what is seen in it as soon as the camera is decoded."""
+    async def _show(self) -> None:
+        """List the images of the camera, show the chosen one, and what is seen in it once the camera is decoded."""
+        raw, camera = self.raw, self.state.i_camera
+        if raw is None or not camera:
+            return
+        with self.state as s:
+            s.i_names = raw.names(camera)
+            name = s.i_name = s.i_name if s.i_name in s.i_names else s.i_names[0]
+        if self.shown == (shown := (raw, camera, name)):
+            return
+        self.shown = shown
         image = await asyncio.to_thread(raw.read, camera, name)
         with self.state as s:
             if (s.i_camera, s.i_name) != (camera, name):
@@ -114,21 +113,17 @@ class Images:
             s.i_radius = found.optics.pupil_radius_mm
             s.i_source = "measured by the run" if raw.measured else "nominal, not calibrated yet"
             if (s.i_camera, s.i_name) == (camera, name):
-                self._mark()
-                self._pupil()
-                self._refocus()
+                self._draw(self._mark, self._pupil, self._refocus)
 
-    @property
-    def decoded(self) -> RawImages | None:
-        """The images, once their cameras are known and an image is chosen."""
-        return self.raw if self.raw is not None and self.raw.cameras and self.state.i_name else None
+    def _draw(self, *parts: Callable[[RawImages], None]) -> None:
+        """Draw parts of what is seen, once the cameras are known and an image is chosen."""
+        if self.raw is not None and self.raw.cameras and self.state.i_name:
+            for part in parts:
+                part(self.raw)
 
-    def _mark(self) -> None:
+    def _mark(self, raw: RawImages) -> None:
         """Put lattice, dots, axes and marked pixels over the picture."""
-        raw, s = self.decoded, self.state
-        if raw is None:
-            return
-        camera, name = s.i_camera, s.i_name
+        s, camera, name = self.state, self.state.i_camera, self.state.i_name
         image = raw.read(camera, name)
         marks, facts = [], [f"{image.min():.6g} to {image.max():.6g} counts, mean {image.mean():.5g}"]
         optics = raw.calibrated(camera).optics
@@ -156,22 +151,18 @@ class Images:
 
     def follow(self, place: list[float]) -> None:
         """Look through the pupil point that the pixel under the pointer sees."""
-        if (raw := self.decoded) is not None and self.state.i_follow:
-            u, v = raw.pupil_at(self.state.i_camera, (place[0], place[1]))
+        if self.raw is not None and self.raw.cameras and self.state.i_follow:
+            u, v = self.raw.pupil_at(self.state.i_camera, (place[0], place[1]))
             self.state.i_u, self.state.i_v = float(f"{u:.4g}"), float(f"{v:.4g}")
 
-    def _pupil(self) -> None:
-        raw, s = self.decoded, self.state
-        if raw is None:
-            return
+    def _pupil(self, raw: RawImages) -> None:
+        s = self.state
         view = raw.pupil_view(s.i_camera, s.i_name, (float(s.i_u), float(s.i_v)))
         s.i_pupil_high = float(np.percentile(view, 99.7)) or 1.0
         s.i_pupil = sent(view)
 
-    def _refocus(self) -> None:
-        raw, s = self.decoded, self.state
-        if raw is None:
-            return
+    def _refocus(self, raw: RawImages) -> None:
+        s = self.state
         names = [camera for camera in s.i_cameras if s.i_name in raw.names(camera)]
         shown = [s.i_camera, *(name for name in names if name != s.i_camera)] if s.i_both else [s.i_camera]
         planes = [raw.refocused(camera, s.i_name, float(s.i_z)) for camera in shown[:2]]
@@ -183,11 +174,7 @@ class Images:
     def _panel(self) -> None:
         with html.Div(classes="lf-split"):
             with html.Div(classes="lf-panel"):
-                html.Div(
-                    NO_EXPERIMENT,
-                    v_if="!experiment_name",
-                    classes="lf-note",
-                )
+                html.Div(NO_EXPERIMENT, v_if="!experiment_name", classes="lf-note")
                 html.Div("{{ i_busy }} ...", v_if="i_busy", classes="lf-note", role="status")
                 controls.choice("i_camera", "camera", ("i_cameras",), id="i-camera")
                 controls.choice("i_name", "image", ("i_names",), id="i-name")

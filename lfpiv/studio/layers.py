@@ -9,8 +9,10 @@ from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
 import lfpiv
 
-MOVING_ARROWS, MOVING_LINES = 1500, 25
-"""Arrows, and lengths of streamlines, that are drawn in time while something moves."""
+MOVING_ARROWS = 1500
+"""Arrows that are drawn in time while something moves."""
+LONGEST_LINE, LINES, MOVING_LINES = 4.0, 200.0, 40.0
+"""Longest streamline, and all of them together at rest and while something moves, in diagonals of the volume."""
 
 
 def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
@@ -55,11 +57,9 @@ def trusted(grid: pv.ImageData, replaced: bool, uncertainty: float | None) -> pv
     if not hidden.any():
         return grid
     shown = grid.copy(deep=False)
-    for name in grid.point_data:
+    for name, values in grid.point_data.items():
         if name != "valid":
-            values = np.array(grid[name])
-            values[hidden] = np.nan
-            shown[name] = values
+            shown[name] = np.where(hidden.reshape(-1, *[1] * (values.ndim - 1)), np.float32(np.nan), values)
     return shown
 
 
@@ -123,19 +123,23 @@ def arrows(
 
 
 def stream_lines(grid: pv.ImageData, seeds: int, colour: str, moving: bool = False) -> pv.PolyData:
-    """Return streamlines from a number of points in the volume, drawn as tubes.
-
-    While something moves they are thin, and all of them together as long as `MOVING_LINES` are at rest.
-    """
+    """Return streamlines from a number of points in the volume; shorter ones while something moves."""
     filled = slim(grid, colour)
     filled["velocity"] = np.nan_to_num(grid["velocity"])
     low, high = np.array(grid.bounds[::2]), np.array(grid.bounds[1::2])
     places = low + (high - low) * np.random.default_rng(0).random((seeds, 3))
-    longest = 4 * grid.length * (min(1.0, MOVING_LINES / seeds) if moving else 1.0)
-    lines = filled.streamlines_from_source(
+    longest = grid.length * min(LONGEST_LINE, (MOVING_LINES if moving else LINES) / seeds)
+    return filled.streamlines_from_source(
         pv.PolyData(places), vectors="velocity", integration_direction="both", max_length=longest
     )
-    return lines if moving or not lines.n_points else lines.tube(radius=grid.length / 500, n_sides=4)
+
+
+def cloud_of(name: str, results: str, moment: str) -> pv.PolyData | None:
+    """Return the "particles" or "tracks" of a run at a moment; None for particles of a statistic."""
+    number = int(moment) if moment.isdigit() else None
+    if name == "tracks":
+        return track_lines(lfpiv.open_tracks(results), number)
+    return None if number is None else points_of(lfpiv.open_particles(results, pairs=(number, number + 1)))
 
 
 def points_of(table: xr.Dataset, good: np.ndarray | None = None) -> pv.PolyData:

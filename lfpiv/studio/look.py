@@ -16,8 +16,12 @@ INK = {"light": "#202327", "dark": "#e6e8ea"}
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "xy"}
 REPLACED = "#8a8f98"
 """Colour of vectors that are replaced."""
-EVEN_TICKS = 0.6
-"""Least side, as a share of the longest, that has ticks at round numbers."""
+TICKS = (0.15, 0.35, 0.8)
+"""Least sides, as shares of the longest, that have two ticks, three, and ticks at round numbers."""
+LINE_PX = 3
+"""Width of streamlines [pixel]."""
+CLOUDS: dict[str, Any] = {"particles": {"point_size": 4.0}, "tracks": {"line_width": 2.0}}
+"""What is drawn as it is -> its style."""
 SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
 """Fields whose colours are centred on zero."""
 
@@ -98,6 +102,12 @@ class Picture:
         plotter.camera.SetWindowCenter(0.0, -0.08)  # room for the colour scale below
         return cls(plotter)
 
+    def clear(self) -> None:
+        """Remove all that is drawn."""
+        self.plotter.clear()
+        self.drawn.clear()
+        self.placed = False
+
     def show(
         self, whole: pv.ImageData, look: Look, clouds: dict[str, pv.PolyData], title: str, moving: bool = False
     ) -> None:
@@ -140,9 +150,9 @@ class Picture:
         self._layer(
             "lines", look.lines and (key, look.lines, shade),
             lambda: layers.stream_lines(grid, look.lines, look.colour, moving), moving, **paint,
+            line_width=LINE_PX, render_lines_as_tubes=True,
         )  # fmt: skip
-        styles: dict[str, dict[str, Any]] = {"particles": {"point_size": 4.0}, "tracks": {"line_width": 2.0}}
-        for name, style in styles.items():
+        for name, style in CLOUDS.items():
             cloud = clouds.get(name) if getattr(look, name) else None
             colour = paint if cloud is not None and look.colour in cloud.point_data else {"color": ink}
             self._layer(name, cloud is not None and (id(cloud), shade), lambda cloud=cloud: cloud, **colour, **style)
@@ -180,13 +190,15 @@ class Picture:
         plotter.set_background(ground)
         plotter.add_mesh(grid.outline(), color=ink, name="outline", reset_camera=False, render=False)
         plotter.remove_bounds_axes()
-        axes = plotter.show_bounds(
-            bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=11, n_xlabels=4,
-            n_ylabels=4, n_zlabels=3, location="outer", grid=False, ticks="outside", fmt="%.3g", use_3d_text=False,
-            render=False,
-        )  # fmt: skip
         sides = np.ptp(np.reshape(grid.bounds, (3, 2)), axis=1)
-        for number in np.flatnonzero(sides > EVEN_TICKS * sides.max()):
+        ticks = np.digitize(sides / sides.max(), TICKS)
+        x, y, z = ticks.tolist()
+        axes = plotter.show_bounds(
+            bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=11, grid=False,
+            location="outer", n_xlabels=x + 1, n_ylabels=y + 1, n_zlabels=z + 1, show_xlabels=x > 0, show_ylabels=y > 0,
+            show_zlabels=z > 0, ticks="outside", fmt="%.3g", use_3d_text=False, render=False,
+        )  # fmt: skip
+        for number in np.flatnonzero(ticks == len(TICKS)):
             axes.SetAxisLabels(number, None)  # VTK's own, at round numbers, are too many on short sides
         if plotter.scalar_bars:
             plotter.remove_scalar_bar(render=False)
@@ -222,19 +234,15 @@ def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tu
         (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
     ]
     values = "".join(f"    {name}={value!r},\n" for name, value in stated)
-    clouds, number = "", look.moment if look.moment.isdigit() else None
-    chosen = "" if number is None else f", pairs=({number}, {number} + 1)"  # other files may be damaged
-    if look.particles:
-        clouds += f'    clouds["particles"] = points_of(lfpiv.open_particles(results{chosen}))\n'
-    if look.tracks:
-        clouds += f'    clouds["tracks"] = track_lines(lfpiv.open_tracks(results), {number})\n'
+    clouds = [f'"{name}": cloud_of("{name}", results, LOOK.moment)' for name in CLOUDS if getattr(look, name)]
+    chosen = f", pairs=({look.moment}, {look.moment} + 1)" if look.moment.isdigit() else ""  # others may be damaged
     return (
         '"""Draw vectors as they were seen in lfpiv studio. Needs lfpiv and pyvista."""\n\n'
-        "import lfpiv\nfrom lfpiv.studio.layers import field_at, grid_of, points_of, track_lines\n"
+        "import lfpiv\nfrom lfpiv.studio.layers import cloud_of, field_at, grid_of\n"
         f"from lfpiv.studio.look import Look, Picture\n\nRESULTS = {list(results)!r}\nLOOK = Look(\n{values})\n\n"
         "for number, results in enumerate(RESULTS):\n"
         f"    grid = grid_of(field_at(lfpiv.open_results(results{chosen}), LOOK.moment))\n"
-        f"    clouds = {{}}\n{clouds}"
+        f"    clouds = {{{', '.join(clouds)}}}\n"
         f"    picture = Picture.empty({tuple(size)!r})\n"
         f"    picture.show(grid, LOOK, clouds, {title!r})\n"
         f"    picture.plotter.camera_position = {camera!r}\n"

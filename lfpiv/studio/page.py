@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from trame.widgets import vuetify3 as v3
 
 from lfpiv.results.stores import is_store
 from lfpiv.studio import delivery, warning_cards
-from lfpiv.studio.access import Places, belongs, is_run
+from lfpiv.studio.access import Places, is_run
 from lfpiv.studio.form_tab import Form
 from lfpiv.studio.images_tab import Images
 from lfpiv.studio.preview_tab import Preview
@@ -44,7 +43,7 @@ def build(given: Path) -> Session:
          "styles": ["lfpiv_studio/studio.css"], "vue_use": ["lfpivStudio"]}
     )  # fmt: skip
     session = Session(server, Places(root_of(given)))
-    _open(session, given)
+    session.open(given)
     state = server.state
     state.update({"tab": "results" if session.results else next(iter(TABS)), "theme": "light", "message": ""})
     state.update({"message_shown": False, "trame__title": "lfpiv studio"})
@@ -60,8 +59,7 @@ def build(given: Path) -> Session:
         ), v3.Template(v_slot_actions=True):  # fmt: skip
             v3.VBtn("Close", click="message_shown = false", variant="text")
     server.add_protocol_to_configure(delivery.send_at_once)
-    session.changed("experiment")
-    session.changed("results")
+    session.changed("experiment", "results")
     return session
 
 
@@ -80,26 +78,6 @@ def routes() -> list[web.RouteDef]:
 def root_of(given: Path) -> Path:
     """Return the folder that may be looked at: a given folder, or the folder of a given file, run or store."""
     return given if given.is_dir() and not is_store(given) and not is_run(given) else given.parent
-
-
-def _open(session: Session, given: Path) -> None:
-    """Open what was given, and what belongs to it; of a folder what lies nearest to it."""
-    found, runs = session.places.experiments(), session.places.results()
-    if given.is_file() and given.suffix == ".toml":
-        session.experiment = given
-    elif is_store(given) or is_run(given):
-        session.results = given
-        session.experiment = _nearest([path for path in found if belongs(path, given)], given)
-    else:
-        session.experiment = _nearest(found, given)
-    if session.results is None:
-        own = session.experiment
-        session.results = _nearest([run for run in runs if own is None or belongs(own, run)], own or given)
-
-
-def _nearest(found: list[Path], other: Path) -> Path | None:
-    """Return the path that shares most folders with another one; None where there is none."""
-    return max(found, key=lambda path: len(os.path.commonpath([path, other])), default=None)
 
 
 def _bar(session: Session) -> None:

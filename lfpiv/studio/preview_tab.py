@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import copy
 import json
-import subprocess
 import sys
 import tempfile
-from functools import partial
+from asyncio.subprocess import PIPE
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +55,8 @@ class Preview:
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
         self.state.update(dict.fromkeys(("t_windows", "t_busy", "t_before", "t_after", "t_voxels"), ""))
         self.state.update({"t_pairs": 1, "t_plan": []})
-        self.state.change("t_plane", "t_colour", "theme")(lambda **_: session.guarded(self.draw)())
-        self.state.change("t_coarser")(lambda **_: self._tell_voxels())
+        session.on_change(self.draw, "t_plane", "t_colour", "theme")
+        session.on_change(self._tell_voxels, "t_coarser")
         session.listeners.append(self._changed)
         self._panel()
 
@@ -106,13 +105,9 @@ class Preview:
             raise InputError(f"{name}: {text}".lstrip(": "))
         return draft
 
-    def try_it(self) -> None:
+    async def try_it(self) -> None:
         """Measure the pair with the settings of the sliders."""
-        if not self.state.t_busy:
-            self.session.start(self._try(self.trial()))
-
-    async def _try(self, draft: Draft) -> None:
-        session = self.session
+        session, draft = self.session, self.trial()
         with session.busy("t_busy", "measuring the pair"), tempfile.TemporaryDirectory(prefix="lfpiv-") as folder:
             request = {
                 "experiment": str(draft.path), "results": str(session.results or ""), "values": draft.values,
@@ -121,13 +116,13 @@ class Preview:
             answer = json.loads((await self._ask(["-m", "lfpiv.studio.trial"], json.dumps(request)))[-1])
             grid = layers.grid_of(lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze())
         with self.state:
-            self.grids = [self.grids[1] if self.grids[1] is not None else grid, grid]
+            self.grids = [self.grids[1], grid]
             known = "uncertainty" in grid.point_data and np.isfinite(grid["uncertainty"]).any()
             uncertain = f", uncertainty {np.nanmedian(grid['uncertainty']):.3g} voxel" if known else ""
             valid = f"{100 * grid['valid'].mean():.1f} % of {grid.n_points:,} vectors valid"
             text = f"{valid}{uncertain}, {answer['seconds']} s"
             text += "" if answer["calibrated"] else "; nominal cameras, not calibrated yet"
-            self.state.t_before, self.state.t_after = self.state.t_after or text, text
+            self.state.t_before, self.state.t_after = self.state.t_after, text
             self.draw()
 
     def draw(self) -> None:
@@ -154,13 +149,9 @@ class Preview:
         self.session.told("draft")
         self.state.tab = "experiment"
 
-    def plan(self) -> None:
+    async def plan(self) -> None:
         """Ask what the campaign will take."""
-        if self.session.experiment is not None and not self.state.t_busy:
-            self.session.start(self._plan())
-
-    async def _plan(self) -> None:
-        command = ["-m", "lfpiv", "plan", str(self.session.experiment)]
+        command = ["-m", "lfpiv", "plan", str(self.session.edited.path)]
         if self.session.results is not None and self.session.results.is_dir():
             command += ["--out", str(self.session.results)]
         with self.session.busy("t_busy", "doing the first pair, whose times are scaled"):
@@ -170,11 +161,11 @@ class Preview:
 
     async def _ask(self, arguments: list[str], text: str) -> list[str]:
         """Call Python with arguments, and a text as its standard input; return the lines of its standard output."""
-        run = partial(subprocess.run, [sys.executable, *arguments], input=text, capture_output=True, text=True)
-        done = await asyncio.to_thread(run)
-        if done.returncode:
-            raise InputError((done.stderr.splitlines() or [f"{arguments[1]}: ended without an answer."])[-1])
-        return list(done.stdout.splitlines())
+        process = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdin=PIPE, stdout=PIPE, stderr=PIPE)
+        out, err = await process.communicate(text.encode())
+        if process.returncode:
+            raise InputError((err.decode().splitlines() or [f"{arguments[1]}: ended without an answer."])[-1])
+        return out.decode().splitlines()
 
     def _panel(self) -> None:
         guarded = self.session.guarded
@@ -210,6 +201,6 @@ class Preview:
                 controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01, 0.5)
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],), "speed")
             with html.Div(classes="lf-main lf-double", v_show="t_after"), html.Div(classes="lf-views"):
-                names = [f"{name}: {{{{ t_{name} }}}}" for name in ("before", "after")]
+                names = {"before: {{ t_before }}": "t_before", "{{ t_before && 'after: ' }}{{ t_after }}": "t_after"}
                 plotters = [picture.plotter for picture in self.pictures]
-                self.views = controls.linked(plotters, "preview", dict.fromkeys(names, "t_after"))
+                self.views = controls.linked(plotters, "preview", names)

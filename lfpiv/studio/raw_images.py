@@ -125,10 +125,8 @@ class RawImages:
         noise = NORMAL_MAD * float(np.median(np.abs(np.diff(image[:, ::7], axis=0)))) / np.sqrt(2)
         level = float(np.percentile(image[::5, ::5], 5))
         hot = image - level > HOT_RATIO * np.maximum(around - level, 0) + HOT_SIGMA * max(noise, 1.0)
-        return {
-            name: self.recorded_px(camera, np.argwhere(flags)[:, ::-1])
-            for name, flags in (("saturated", clipped), ("hot", hot))
-        }
+        found = {"saturated": clipped, "hot": hot}
+        return {name: self.recorded_px(camera, np.argwhere(flags)[:, ::-1]) for name, flags in found.items()}
 
     def dots(self, camera: str, plane: int) -> tuple[np.ndarray, list[str], np.ndarray]:
         """Return where the dots of a plane lie, what they are called, and their residual arrows.

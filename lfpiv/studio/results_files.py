@@ -81,16 +81,12 @@ class Files:
 
     def vti(self) -> Any:
         """Return the fields of the moment as VTK image data."""
-        return self._written("field.vti", self.results.grid(self._folder, self.results.wanted.moment).save)
+        return self._written("field.vti", self.results.grid(self.results.folders[0], self.results.wanted.moment).save)
 
     def csv(self) -> Any:
         """Return the vectors of the moment as a table, a row each."""
-        vectors = layers.field_at(self.results.open(self._folder), self.results.wanted.moment).load()
+        vectors = layers.field_at(self.results.open(self.results.folders[0]), self.results.wanted.moment).load()
         return self._written("field.csv", lambda path: tables.write_vectors(vectors, path))
-
-    @property
-    def _folder(self) -> str:
-        return str(self.session.results)
 
     def _written(self, name: str, write: Any) -> Any:
         with tempfile.TemporaryDirectory() as folder:

@@ -6,14 +6,12 @@ import asyncio
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyvista as pv
 import trame_client.widgets.html as html
 import xarray as xr
 
-import lfpiv
 from lfpiv.errors import InputError
 from lfpiv.results.reader import open_readable
 from lfpiv.studio import charts, controls, layers, look
@@ -22,8 +20,7 @@ from lfpiv.studio.results_files import FRAMES_PER_S, Files
 from lfpiv.studio.session import Session
 
 COLOURS = ("", "viridis", "magma", "coolwarm", "turbo", "cividis", "gray")
-CLOUDS = ("particles", "tracks")
-PLAIN = ("moment", "colour", "colours", "level", "opacity", "length", "replaced", "lines", *CLOUDS)
+PLAIN = ("moment", "colour", "colours", "level", "opacity", "length", "replaced", "lines", *look.CLOUDS)
 """What is shown as the state has it."""
 MOST_ARROWS = 40
 """Largest number of arrows along an axis that the slider gives: more fill the picture, and take seconds."""
@@ -37,26 +34,23 @@ class Results:
     def __init__(self, session: Session) -> None:
         self.session, self.state = session, session.state
         self.open, self.grid = lru_cache(2)(self._results), lru_cache(40)(self._grid)
-        self.cloud = lru_cache(4)(self._cloud)
+        self.cloud = lru_cache(4)(layers.cloud_of)
         self.doubtful: set[str] = set()
         self.pictures = (look.Picture.empty(), look.Picture.empty())
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
-        self.pending, self.charted = False, ()  # type: tuple[bool, tuple[Any, ...]]
-        self.rest: asyncio.TimerHandle | None = None
-        self.state.update(
-            {
-                "r_moments": [], "r_numbers": 0, "r_fields": [], "r_box": [[0, 1, 0.1]] * 3,
-                "r_ends": [0.0, 1.0, 0.01], "r_fewest": 1, "r_has": [], "r_playing": False, "r_chart": "",
-                "r_others": [], "r_left": {},
-            }
-        )  # fmt: skip
+        self.charted: tuple[object, ...] = ()
+        self.next: asyncio.Handle | None = None  # the next drawing
+        self.state.update({
+            "r_moments": [], "r_numbers": 0, "r_fields": [], "r_box": [[0, 1, 0.1]] * 3, "r_ends": [0.0, 1.0, 0.01],
+            "r_fewest": 1, "r_has": [], "r_playing": False, "r_chart": "", "r_others": [], "r_left": {},
+        })  # fmt: skip
         others = "own low high on_x on_y on_z x y z hide every limited other chart_kind".split()
         watched = (f"r_{name}" for name in (*(item.name for item in fields(look.Look)), *others))
-        self.state.change("theme", *watched)(lambda **_: self.request())
-        self.state.change("r_step")(self._step_to)
-        self.state.change("r_surface")(lambda **_: self._range_of_level())
-        self.state.change("r_playing")(lambda **_: session.start(self._play()))
-        self.state.change("r_open")(lambda r_open, **_: r_open and session.guarded(session.choose)("results", r_open))
+        session.on_change(self.request, "theme", *watched)
+        session.on_change(self._step_to, "r_step")
+        session.on_change(self._range_of_level, "r_surface")
+        session.on_change(self._play, "r_playing")
+        session.on_change(lambda: session.choose(self.state.results_open), "results_open")
         self.files = Files(self)
         session.listeners.append(self._opened)
         session.server.controller.on_client_connected.add(lambda **_: self.request())  # the chart, after the picture
@@ -74,8 +68,10 @@ class Results:
         others = [{"title": places.name(path), "value": str(path)} for path in places.results()]
         self.state.r_others = [{"title": "nothing", "value": ""}, *others]
         if folder is None:
-            return
-        self.state.r_open = str(folder)
+            self.state.update({"r_moments": [], "r_numbers": 0, "r_chart": ""})
+            for picture in self.pictures:
+                picture.clear()
+            return self.request()
         results = self.open(str(folder))
         noun = "instant" if "instant" in results.dims else "pair"
         titles = {str(number): f"{noun} {number}" for number in results[noun].values}
@@ -105,15 +101,6 @@ class Results:
         self.doubtful.add(folder)  # a file is wrong of which the opening read the first bytes only
         self.open.cache_clear()
         return self._grid(folder, moment)
-
-    def _cloud(self, name: str, folder: str, moment: str) -> pv.PolyData | None:
-        """Return particles or tracks at a moment; None for particles of a statistic."""
-        number = int(moment) if moment.isdigit() else None
-        if name == "tracks":
-            return layers.track_lines(lfpiv.open_tracks(folder), number)
-        if number is None:
-            return None
-        return layers.points_of(lfpiv.open_particles(folder, pairs=(number, number + 1)))
 
     def _first_look(self) -> None:
         """Choose places, levels and lists that suit the fields."""
@@ -152,22 +139,16 @@ class Results:
         )  # fmt: skip
 
     def request(self) -> None:
-        """Draw soon. Requests that come meanwhile are answered by the same picture."""
-        if not self.pending:
-            self.pending = True
-            asyncio.get_running_loop().call_soon(self._draw_requested)
-
-    def _draw_requested(self) -> None:
-        self.pending = False
-        if self.rest is not None:
-            self.rest.cancel()
-        self._draw_now(moving := not self.state.r_playing)
-        if moving:
-            self.rest = asyncio.get_running_loop().call_later(REST_S, self._draw_now, False)
+        """Draw soon, and with all pixels when nothing changes any more."""
+        if self.next is not None:
+            self.next.cancel()
+        self.next = asyncio.get_running_loop().call_soon(self._draw_now, not self.state.r_playing)
 
     def _draw_now(self, moving: bool) -> None:
         with self.state:
             self.session.guarded(self.draw)(moving)
+        if moving:
+            self.next = asyncio.get_running_loop().call_later(REST_S, self._draw_now, False)
 
     @property
     def folders(self) -> list[str]:
@@ -188,7 +169,7 @@ class Results:
             grid = self.grid(folder, wanted.moment)
             if wanted.colour not in grid.array_names:
                 raise InputError(f"{title_of(wanted.colour)}: {folder} has no such field. Choose another colour.")
-            clouds = {name: self.cloud(name, folder, wanted.moment) for name in CLOUDS if getattr(wanted, name)}
+            clouds = {name: self.cloud(name, folder, wanted.moment) for name in look.CLOUDS if getattr(wanted, name)}
             picture.show(grid, wanted, clouds, title_of(wanted.colour), moving)
 
     def draw(self, moving: bool = False) -> None:
@@ -231,9 +212,9 @@ class Results:
         titles = [title_of(wanted.colour), "number of vectors"]
         self.state.r_chart = charts.chart(lines, *(titles if kind == "histogram" else [f"{kind} [mm]", titles[0]]))
 
-    def _step_to(self, r_step: int, **_: Any) -> None:
+    def _step_to(self) -> None:
         if self.session.results is not None and self.state.r_numbers:
-            self.state.r_moment = self.state.r_moments[int(r_step)]["value"]
+            self.state.r_moment = self.state.r_moments[int(self.state.r_step)]["value"]
 
     async def _play(self) -> None:
         """Show one moment after the other until it is stopped."""
@@ -266,11 +247,8 @@ class Results:
                 self.views = controls.linked(plotters, "results", names, lambda: bool(self.state.r_other))
 
     def _moment_controls(self) -> None:
-        html.Div(
-            "No results yet: start a run in the tab Runs.", v_if="r_others.length < 2 && !results_name",
-            classes="lf-note",
-        )  # fmt: skip
-        controls.choice("r_open", "results", ("r_others.slice(1)",), id="r-open", v_if="r_others.length > 1")
+        html.Div("No results are open: start a run in the tab Runs.", v_if="!results_name", classes="lf-note")
+        controls.choice("results_open", "results", ("r_others.slice(1)",), id="r-open", v_if="r_others.length > 1")
         with html.Template(v_for="cards in r_left"):
             with html.Div(v_for="card in cards", key="card.name", classes="lf-card lf-left", role="alert"):
                 html.B("{{ card.name }} is left out")

@@ -55,11 +55,6 @@ class View:
         return np.asarray((points @ sides[:, :3].T + sides[:, 3] >= 0).all(axis=1))
 
 
-def body(place: np.ndarray, size: float) -> pv.PolyData:
-    """Return a cone where a camera stands; it points at the origin."""
-    return pv.Cone(center=place, direction=-place, height=size, radius=size / 2)
-
-
 def count_seen(views: list[View], centre: np.ndarray, size: np.ndarray) -> pv.ImageData:
     """Return how many cameras see each place of the volume, as cells of a coarse grid."""
     counts = np.maximum(2, np.round(SEEN_VOXELS * size / size.max())).astype(int)

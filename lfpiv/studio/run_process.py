@@ -15,7 +15,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,8 @@ import psutil
 from lfpiv.errors import InputError
 from lfpiv.progress import PROGRESS_FILE
 from lfpiv.quantities import duration
-from lfpiv.records import RecordError, read_object, read_text
-from lfpiv.results.folder import Folder, make_writable
+from lfpiv.records import RecordError, read_object, read_text, validate
+from lfpiv.results.folder import Folder, Holder, make_writable
 from lfpiv.warn import Warning
 
 LOG, PROGRESS = ".run.log", ".run.jsonl"
@@ -41,23 +40,13 @@ LARGEST_BYTES = 1 << 20
 """Bytes at the end of log and progress that are read."""
 
 
-@dataclass(frozen=True)
-class Holder:
-    """The process that writes into a folder of results."""
-
-    process: int
-    since: str
-
-
 def holder(out: Path) -> Holder | None:
     """Return the process of this machine that holds a folder, or None."""
     try:
-        found = read_object(read_text(Folder(out).lock))
-        process = int(found["process"])
-        here = found["host"] == socket.gethostname() and psutil.pid_exists(process)
-    except (OSError, RecordError, KeyError, TypeError, ValueError):
+        found = validate(Holder, read_object(read_text(Folder(out).lock)))
+    except (OSError, RecordError):
         return None
-    return Holder(process, str(found.get("since", ""))[:40]) if here else None
+    return found if found.host == socket.gethostname() and psutil.pid_exists(found.process) else None
 
 
 def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
@@ -71,7 +60,7 @@ def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
     if (other := holder(out)) is not None:
         raise InputError(
             f"{out}: expected a folder that no other run writes to, found it held by process {other.process} since "
-            f"{other.since}. Wait for its end, stop it, or choose another folder."
+            f"{other.since[:40]}. Wait for its end, stop it, or choose another folder."
         )
     make_writable(out)
     for name in (LOG, PROGRESS):
@@ -125,12 +114,10 @@ def control(process: int, what: str) -> None:
 
 def tail(path: Path) -> str:
     """Return the end of a text file; "" where there is none."""
-    try:
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - LARGEST_BYTES))
-            return file.read().decode("utf-8", errors="replace")
-    except OSError:
-        return ""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - LARGEST_BYTES))
+        return file.read().decode("utf-8", errors="replace")
+    return ""
 
 
 def logged_warnings(out: Path) -> list[str]:

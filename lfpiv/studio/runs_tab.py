@@ -27,12 +27,10 @@ class Runs:
         self.session, self.state = session, session.state
         self.process: int | None = None
         self.stopped = False
-        self.state.update(
-            {
-                "p_out": "results", "p_pairs": "", "p_workers": "", "p_status": "none", "p_stages": [], "p_log": "",
-                "p_warnings": [], "p_end": "", "p_left": "",
-            }
-        )  # fmt: skip
+        self.state.update({
+            "p_out": "results", "p_pairs": "", "p_workers": "", "p_status": "none", "p_stages": [], "p_log": "",
+            "p_warnings": [], "p_end": "", "p_left": "",
+        })  # fmt: skip
         session.listeners.append(self._changed)
         session.server.controller.on_server_ready.add(lambda **_: session.start(self._watch()))
         session.closers.append(self._close)
@@ -142,11 +140,8 @@ class Runs:
                 for what, when in shown.items():
                     icon, look = f"mdi-{what.replace('resume', 'play')}", {"color": "error"} if what == "stop" else {}
                     controls.button(what.title(), (control, f"['{what}']"), icon, id=f"p-{what}", v_if=when, **look)
-                html.Span(
-                    f"{{{{ !{running} ? p_end : p_status }}}} {{{{ p_status === 'running' ? p_left : '' }}}}",
-                    id="p-status",
-                    role="status",
-                )
+                said = f"{{{{ !{running} ? p_end : p_status }}}} {{{{ p_status === 'running' ? p_left : '' }}}}"
+                html.Span(said, id="p-status", role="status")
             html.Div(
                 "The run goes on without this page and without the studio; `lfpiv run` with the same file and folder "
                 "continues it.", v_if=running, classes="lf-note",
@@ -172,11 +167,6 @@ class Runs:
         """Show the bar of a stage or of a pair."""
         with html.Div(classes=classes):
             html.Span(f"{{{{ {name}.name }}}}")
-            v3.VProgressLinear(
-                model_value=(f"{name}.percent",),
-                height=8,
-                rounded=True,
-                color="primary",
-                raw_attrs=[f':aria-label="{name}.name"'],
-            )
+            named = {"raw_attrs": [f':aria-label="{name}.name"']}
+            v3.VProgressLinear(model_value=(f"{name}.percent",), height=8, rounded=True, color="primary", **named)
             html.Span(f"{{{{ {name}.percent }}}} % {{{{ {name}.left }}}}", classes="lf-note")

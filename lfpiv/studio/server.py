@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib.util
 import logging
 import os
+import secrets
 import signal
 import sys
 import webbrowser
@@ -80,20 +82,23 @@ def serve(
 
 async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], None] | None) -> None:
     """Serve until a signal comes. Then runs are closed or left, and the process ends whatever its threads read."""
+    gc.disable()  # collections while modules are imported take a fifth of the start
     import pyvista
 
     from lfpiv.studio import access, page
 
     pyvista.vtk_verbosity("error")  # VTK warns where it finds no screen, and then draws without
-    token, session = access.Token(), page.build(given)
+    token, session = secrets.token_urlsafe(24), page.build(given)
     server = session.server
+    gc.freeze()
+    gc.enable()
 
     def bind(bound: Any) -> None:
-        bound.app.middlewares.append(token.middleware())
+        bound.app.middlewares.append(access.guard(token))
         bound.app.add_routes(page.routes())
 
     def started(**_: Any) -> None:
-        address = f"http://127.0.0.1:{server.port}/index.html?token={token.word}"
+        address = f"http://127.0.0.1:{server.port}/index.html?token={token}"
         if ready is not None:
             ready(address)
         if browser:

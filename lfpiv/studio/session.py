@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Coroutine, Iterator
+import os
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from lfpiv.errors import InputError
-from lfpiv.studio.access import Places
+from lfpiv.results.stores import is_store
+from lfpiv.studio.access import Places, belongs, is_run
 from lfpiv.studio.draft import Draft
 
 log = logging.getLogger(__name__)
@@ -51,18 +53,37 @@ class Session:
             raise InputError("experiment: expected a readable experiment file, found none. Open one in tab Experiment.")
         return self.draft
 
-    def choose(self, what: str, path: str) -> None:
-        """Open another "experiment" or other "results"."""
-        found = self.places.within(path)
-        if found != getattr(self, what):
-            setattr(self, what, found)
-            self.changed(what)
+    def open(self, given: Path) -> None:
+        """Open an experiment file or results, and what belongs to it; of a folder what lies nearest to it."""
 
-    def changed(self, what: str) -> None:
-        """Tell all tabs that the experiment or the results changed."""
-        self.state.experiment_name = self.places.name(self.experiment) if self.experiment else ""
-        self.state.results_name = self.places.name(self.results) if self.results else ""
-        self.told(what)
+        def nearest(found: Iterable[Path], to: Path = given) -> Path | None:
+            return max(found, key=lambda path: len(os.path.commonpath([path, to])), default=None)
+
+        files, runs = self.places.experiments(), self.places.results()
+        if is_store(given) or is_run(given):
+            self.experiment, self.results = nearest(path for path in files if belongs(path, given)), given
+        else:
+            self.experiment = own = given if given.is_file() else nearest(files)
+            self.results = nearest((run for run in runs if own is None or belongs(own, run)), own or given)
+
+    def choose(self, path: str) -> None:
+        """Open another experiment file or other results with what belongs to it, unless changes would be lost."""
+        before = {"experiment": self.experiment, "results": self.results}
+        if not path or (found := self.places.within(path)) in before.values():
+            return
+        if not (kept := self.draft is not None and self.draft.changed):
+            self.open(found)
+        self.changed(*(what for what, was in before.items() if getattr(self, what) != was))
+        if kept:
+            raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
+
+    def changed(self, *whats: str) -> None:
+        """Tell all tabs what is open, and whether the "experiment" or the "results" changed."""
+        for name, path in (("experiment", self.experiment), ("results", self.results)):
+            self.state[f"{name}_open"] = str(path or "")
+            self.state[f"{name}_name"] = self.places.name(path) if path else ""
+        for what in whats:
+            self.told(what)
 
     def told(self, what: str) -> None:
         """Call the listeners."""
@@ -70,14 +91,15 @@ class Session:
             self.guarded(listener)(what)
 
     def guarded(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function whose errors are shown on the page."""
+        """Return a function whose errors are shown on the page; a coroutine is done beside it."""
 
         def call(*given: Any, **named: Any) -> Any:
             try:
-                return function(*given, **named)
+                result = function(*given, **named)
             except Exception as error:
                 self.tell(error)
                 return None
+            return self.start(result) if asyncio.iscoroutine(result) else result
 
         return call
 
@@ -88,6 +110,10 @@ class Session:
             log.error("studio", exc_info=error)  # type: ignore[arg-type]
         self.state.message = str(error) if expected else f"unexpected {type(error).__name__}: {error}"
         self.state.message_shown = True
+
+    def on_change(self, function: Callable[..., Any], *names: str) -> None:
+        """Call a function, guarded, when values of the state change."""
+        self.state.change(*names)(lambda **_: self.guarded(function)())
 
     def start(self, work: Coroutine[Any, Any, Any]) -> None:
         """Do work beside the page, which stays alive; its errors are shown there."""

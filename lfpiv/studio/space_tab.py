@@ -37,8 +37,8 @@ class Space:
         self.placed, self.dragged, self.box = False, False, np.zeros(6)
         self.shapes: dict[str, tuple[int, int]] = {}
         self.state.update({"s_drags": [], "s_facts": []})
-        self.state.change("s_seen", "s_board", "s_cameras", "s_drag", "theme")(lambda **_: session.guarded(self.draw)())
-        self.state.change("tab")(lambda tab, **_: tab == "space" and session.guarded(self.draw)())
+        session.on_change(self.draw, "s_seen", "s_board", "s_cameras", "s_drag", "theme")
+        session.on_change(lambda: self.draw() if self.state.tab == "space" else None, "tab")
         session.listeners.append(self._changed)
         self._panel()
 
@@ -78,7 +78,8 @@ class Space:
                 distance, place = view.camera.distance, np.asarray(view.camera.position)
                 near, label = (place * min(1.0, part * length / distance) for part in (1.0, 1.3))
                 p.add_mesh(view.pyramid(length), color=colour, line_width=2, render=False)
-                p.add_mesh(rig_space.body(near, 0.14 * length), color=colour, render=False)
+                body = pv.Cone(center=near, direction=-near, height=0.14 * length, radius=0.07 * length)
+                p.add_mesh(body, color=colour, render=False)
                 p.add_point_labels(
                     [label], [camera.name], text_color=colour, shape=None, font_size=14, show_points=False, render=False
                 )

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from types import SimpleNamespace
 
 import pytest
 
@@ -71,6 +72,35 @@ def test_results_belong_to_the_experiment_file_that_their_summary_names(tmp_path
     assert {file for file in files if belongs(tmp_path / file, results)} == found
 
 
+def test_chosen_results_open_their_experiment_file_or_none_and_no_changes_are_lost(tmp_path):
+    from lfpiv.errors import InputError
+    from lfpiv.studio.access import Places
+    from lfpiv.studio.session import Session
+
+    for name, stated in (("a", "a/a.toml"), ("b", "b/b.toml"), ("c", "gone/c.toml")):
+        (tmp_path / name / "run" / "vectors").mkdir(parents=True)
+        (tmp_path / name / "run" / "vectors" / "pair_0000.nc").touch()
+        (tmp_path / name / "run" / "summary.json").write_text(json.dumps({"experiment": {"file": stated}}), "utf-8")
+    for name in "ab":
+        (tmp_path / name / f"{name}.toml").write_text("[[camera]]\nwhite_image = 1\n[volume]\n", "utf-8")
+    session = Session(SimpleNamespace(state={}), Places(tmp_path))
+    told = []
+    session.listeners.append(told.append)
+    session.open(tmp_path)
+    assert (session.experiment, session.results) == (tmp_path / "a" / "a.toml", tmp_path / "a" / "run")
+    session.choose("b/run")
+    assert session.experiment == tmp_path / "b" / "b.toml" and told == ["experiment", "results"]
+    session.choose("a/a.toml")
+    assert session.results == tmp_path / "a" / "run"
+    session.draft = SimpleNamespace(changed=True)
+    with pytest.raises(InputError, match="Save them first, or undo them"):
+        session.choose("b/run")
+    assert session.results == tmp_path / "a" / "run" and session.state["results_open"] == str(session.results)
+    session.draft = None
+    session.choose("c/run")
+    assert session.experiment is None and session.state["results_name"] == "c/run"
+
+
 @pytest.mark.browser
 def test_results_without_an_experiment_file_open_none(tmp_path, browser):
     from support.report_run import field
@@ -92,10 +122,10 @@ def test_a_page_that_closes_while_pictures_come_logs_nothing(caplog):
     from aiohttp import web
     from aiohttp.test_utils import make_mocked_request
 
-    from lfpiv.studio.access import Token
+    from lfpiv.studio.access import guard
     from lfpiv.studio.server import quiet_closed_pages
 
-    token, messages = Token(), logging.getLogger("wslink.protocol")
+    token, messages = "word", logging.getLogger("wslink.protocol")
     quiet_closed_pages()
 
     def fails(error):
@@ -106,8 +136,8 @@ def test_a_page_that_closes_while_pictures_come_logs_nothing(caplog):
                 messages.error("Exception raised")
                 raise
 
-        request = make_mocked_request("GET", f"/ws?token={token.word}", headers={"Host": "127.0.0.1:80"})
-        return asyncio.run(token.middleware()(request, handler))
+        request = make_mocked_request("GET", f"/ws?token={token}", headers={"Host": "127.0.0.1:80"})
+        return asyncio.run(guard(token)(request, handler))
 
     assert isinstance(fails(ConnectionResetError("Cannot write to closing transport")), web.Response)
     assert not caplog.records

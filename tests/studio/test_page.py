@@ -178,13 +178,15 @@ def test_a_mistake_is_told_as_one_types_and_the_keyboard_saves(page):
 def test_a_file_with_a_slip_is_told_where_it_was_opened_and_leaves_no_other_form(page):
     wrong = page.folder / "wrong.toml"
     wrong.write_text((page.folder / "experiment.toml").read_text("utf-8").replace("[volume]", "[volume"), "utf-8")
-    page.browser.execute_script("trame.state.set('x_open', arguments[0])", str(wrong))
+    page.browser.execute_script("trame.state.set('experiment_open', arguments[0])", str(wrong))
     until(lambda: "expected the name of a table" in "".join(page.get("x_elsewhere")))
     assert page.get("x_tables") == []
     wrong.unlink()
     page.browser.find_element("css selector", ".lf-message button").click()
     until(lambda: not page.get("message_shown"))
-    page.browser.execute_script("trame.state.set('x_open', arguments[0])", str(page.folder / "experiment.toml"))
+    page.browser.execute_script(
+        "trame.state.set('experiment_open', arguments[0])", str(page.folder / "experiment.toml")
+    )
     until(lambda: page.get("x_tables") and not page.get("x_elsewhere"))
 
 

@@ -1,17 +1,17 @@
 // A picture of counts: zoomed by the wheel or + and -, moved by dragging or the arrow keys, with marks over it.
 (() => {
-  const { h, ref, watch, onMounted, onBeforeUnmount } = Vue;
+  const { h, ref, watch, onMounted } = Vue;
 
   const LfImage = {
-    props: { image: Object, low: Number, high: Number, marks: Array, colours: String, name: String, smooth: Boolean, region: Array },
-    emits: ['point', 'pick'],
+    props: { image: Object, low: Number, high: Number, marks: Array, name: String, smooth: Boolean, region: Array },
+    emits: ['point'],
     setup(props, { emit }) {
       const box = ref(null), canvas = ref(null), readout = ref('');
-      let data = null, bitmap = null, view = null, drag = null, moved = 0;
+      let data = null, bitmap = null, view = null, drag = null;
 
       function load() {
         const wanted = props.image && Vue.toRaw(props.image);
-        if (!wanted) return;
+        if (!wanted) { data = bitmap = null; draw(); return; }
         if (!data || data.rows !== wanted.rows || data.columns !== wanted.columns) view = null;
         data = { ...wanted, values: new Float32Array(wanted.values.slice().buffer) };
         paint();
@@ -74,14 +74,13 @@
           for (const [a, b, c, d] of places) arrow(context, ...at(a, b), ...at(c, d));
           return;
         }
-        if (mark.kind === 'points' && size < 1.5) context.globalAlpha = 0.6;
         places.forEach(([column, row], number) => {
           const [x, y] = at(column, row);
           if (x < -20 || y < -20 || x > canvas.value.width + 20 || y > canvas.value.height + 20) return;
           context.beginPath();
           context.arc(x, y, Math.max(size, 1), 0, 7);
           if (mark.kind === 'points') context.fill(); else context.stroke();
-          if (mark.names && view.scale > (mark.names_from || 0)) {
+          if (mark.names) {
             context.font = '12px sans-serif';
             Object.assign(context, { lineWidth: 3, strokeStyle: 'rgba(14, 16, 19, 0.85)' });  // read on any picture
             context.strokeText(mark.names[number], x + size + 2, y - size);
@@ -89,7 +88,6 @@
             Object.assign(context, { lineWidth: 1.5, strokeStyle: mark.colour });
           }
         });
-        context.globalAlpha = 1;
       }
 
       function arrow(context, x, y, u, v) {
@@ -128,7 +126,6 @@
         if (!view || !data) return;
         const spot = place(event);
         if (drag) {
-          moved += Math.abs(spot.x - drag.x) + Math.abs(spot.y - drag.y);
           view.x += spot.x - drag.x; view.y += spot.y - drag.y;
           drag = spot;
           draw();
@@ -147,9 +144,7 @@
         point({ column: (width / 2 - view.x) / view.scale, row: (height / 2 - view.y) / view.scale });
       }
 
-      let observer = null;
-      onMounted(() => { observer = new ResizeObserver(draw); observer.observe(box.value); load(); });
-      onBeforeUnmount(() => observer && observer.disconnect());
+      onMounted(() => { new ResizeObserver(draw).observe(box.value); load(); });
       watch(() => props.image, load);
       watch(() => [props.low, props.high], paint);
       watch(() => props.marks, draw);
@@ -158,8 +153,8 @@
         h('canvas', {
           ref: canvas, tabindex: 0, role: 'img', 'aria-label': props.name,
           onPointermove: move,
-          onPointerdown: (event) => { if (view) { drag = place(event); moved = 0; event.target.setPointerCapture(event.pointerId); } },
-          onPointerup: (event) => { if (drag && moved < 4) emit('pick', [place(event).column, place(event).row]); drag = null; },
+          onPointerdown: (event) => { if (view) { drag = place(event); event.target.setPointerCapture(event.pointerId); } },
+          onPointerup: () => { drag = null; },
           onWheel: (event) => { event.preventDefault(); if (view) { const s = place(event); zoom(s.x, s.y, event.deltaY < 0 ? 1.25 : 0.8); } },
           onDblclick: () => { view = null; draw(); },
           onKeydown: key,
