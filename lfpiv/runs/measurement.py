@@ -23,7 +23,7 @@ from lfpiv.results.pair_files import PairVolumes
 from lfpiv.runs import memory, rig, worker_plan
 from lfpiv.runs.frame_light import FrameLight, pair_light
 from lfpiv.runs.pair import PairWork
-from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED
+from lfpiv.runs.pair_outcome import CORRELATED, PREPARED, RECONSTRUCTED
 from lfpiv.runs.run import open_run
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Rig(Shown):
     def vectors(self, pair: int, progress: StepProgress | None = None) -> xr.Dataset:
         """Measure one pair; see `measure_pair`."""
         step = progress or _ignore
-        volumes = self._volumes(pair, part_of(step, 0.0, RECONSTRUCTED))
+        volumes = self._volumes(pair, part_of(step, PREPARED, RECONSTRUCTED))
         step(RECONSTRUCTED)
         with threadpool_limits(1):  # as in a run, whose numbers do not depend on the threads of BLAS
             if self.experiment.by_links:

@@ -29,7 +29,7 @@ from lfpiv.runs.frame_light import FrameLight
 from lfpiv.runs.frame_work import FrameWork
 from lfpiv.runs.frames import Frames, JointFrames, failure
 from lfpiv.runs.pair_figures import PairFigures
-from lfpiv.runs.pair_outcome import CORRELATED, RECONSTRUCTED, Computed, Outcome, PairProgress
+from lfpiv.runs.pair_outcome import CORRELATED, PREPARED, RECONSTRUCTED, Computed, Outcome, PairProgress
 from lfpiv.runs.pair_vectors import REFUSED, measure_vectors, without_unmeasured
 from lfpiv.runs.pair_volumes import Reconstructor, reconstruction_s
 from lfpiv.runs.particles import FrameFits, refused, track
@@ -129,7 +129,7 @@ class PairWork(FrameWork):
         if files.outdated(**wanted) is None:
             log.info("%s: was finished by a worker that died afterwards", self.experiment.name_of(pair))
             return
-        volumes = self.volumes(files, frames, part_of(progress, 0.0, RECONSTRUCTED if self.vectors else 1.0))
+        volumes = self.volumes(files, frames, part_of(progress, PREPARED, RECONSTRUCTED if self.vectors else 1.0))
         if self.vectors:
             progress(RECONSTRUCTED)
             self._correlate(files, volumes, progress)

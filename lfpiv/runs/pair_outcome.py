@@ -10,8 +10,8 @@ from lfpiv.errors import StorageError
 from lfpiv.progress import StepProgress
 from lfpiv.runs.frames import failure
 
-RECONSTRUCTED = 0.9
-"""Finished fraction of a pair when its volumes are reconstructed, for progress bars."""
+PREPARED, RECONSTRUCTED = 0.05, 0.9
+"""Finished fractions of a pair before its first iteration and when its volumes are reconstructed, for progress bars."""
 
 CORRELATED = 0.99
 """Finished fraction of a pair when only its vectors remain to be written."""
