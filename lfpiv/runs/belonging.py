@@ -14,8 +14,6 @@ from functools import reduce
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
@@ -71,8 +69,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
     shown = ShownParticles(experiment, weights.cameras, tried)
     as_judged = shown if len(tried) > 1 else replace(shown, pairs=())  # one pair does not tell what stands still
     judged = _judge(as_judged, tried, weights)
-    light = next(_light(shown, judged), None)
-    scales = None if light is None else _scales_apart(light[0])
+    scales = _scales_apart(shown.counts(next(iter(judged)))) if judged else None
     refusals = mistakes_of_pairs(experiment, names, judged)
     if not refusals and judged and not any(one.fits for one in judged.values()):
         refusals = _far_delay(experiment, names, as_judged, weights, list(judged))
@@ -143,12 +140,11 @@ def _dark_warnings(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[
     ]
 
 
-def _scales_apart(images: Images) -> Warning | None:
+def _scales_apart(light: Mapping[str, float]) -> Warning | None:
     """Log how far the counts of the cameras differ, if it is much. Return why vectors depend on it, if they do.
 
     A ratio of up to 1 / `DIMMEST` is divided out.
     """
-    light = {name: float(np.mean(image, dtype=float)) for name, image in images.items()}
     bright, dim = max(light, key=light.__getitem__), min(light, key=light.__getitem__)
     if light[dim] <= 0 or (ratio := light[bright] / light[dim]) < UNLIKE_SCALES:
         return None

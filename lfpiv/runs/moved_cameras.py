@@ -18,6 +18,7 @@ from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import read_darks, without_background
+from lfpiv.runs.moved_frames import AGREEING, FRAMES, LIKE, moved_frames
 from lfpiv.selfcalibration.disparity import CameraVolumes, still_light, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
 from lfpiv.warn import Code, Warning, warn
@@ -33,15 +34,6 @@ log = logging.getLogger(__name__)
 
 LARGE_VOXEL = 0.25
 """Disparity of the cameras across their lines of sight above which `check` warns [voxel]."""
-
-FRAMES = 2
-"""Instants of a pair."""
-
-LIKE = 0.5
-"""Least share of the movements shown by all pairs together in those that a pair shows alone, of pairs that agree."""
-
-AGREEING = 2
-"""Least number of pairs that agree on cameras that moved, where more than one was used: chance peaks differ by pair."""
 
 LONE_STD_VOXEL = 0.4
 """Standard error of a distance that one part of the volume shows in one pair, and nothing confirms [voxel]."""
@@ -191,7 +183,10 @@ def check(shown: ShownParticles, weights: Weights, *, in_time: bool) -> CameraDi
         return nothing if nothing == used else []
     separation = fit.separation
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
-    if disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
+    jolt = None if experiment.recording.is_series else moved_frames(volumes, weights.cameras, in_order=in_time)
+    if jolt is not None:
+        warn(log, jolt)
+    elif disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
         warn(log, _apart(disparity, experiment, weights.cameras, in_time=in_time))
     return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pairs=tuple(used))
 
@@ -209,7 +204,8 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
 class ShownParticles:
     """Images of the pairs that show particles, without the light that stays in place in all of them.
 
-    One pair does not tell that light in a slow flow, where particles hardly move between its frames.
+    One pair does not tell that light in a slow flow, where particles hardly move between its frames. All images of a
+    camera are scaled to equal light: one in the place of another is judged by its particles, not by its exposure.
     """
 
     experiment: Experiment
@@ -223,6 +219,11 @@ class ShownParticles:
     @cached_property
     def _recent(self) -> dict[Frame, Mapping[str, np.ndarray]]:
         """The images that were read last, up to `KEPT_BYTES`, and those of a pair in any case."""
+        return {}
+
+    @cached_property
+    def _levels(self) -> dict[Frame, Mapping[str, float]]:
+        """Mean counts of the images that were read, by which they are divided."""
         return {}
 
     @cached_property
@@ -243,6 +244,12 @@ class ShownParticles:
         """Return the images of both frames; raise ValueError if one is missing or damaged, or shows only noise."""
         return [self._moving(frame) for frame in self.experiment.pair_frames(pair)]
 
+    def counts(self, pair: int) -> Mapping[str, float]:
+        """Return the mean count of each camera's first image of a pair as it is stored; raise ValueError as `pair`."""
+        first = self.experiment.pair_frames(pair)[0]
+        moving = self._moving(first)
+        return {name: level * float(np.mean(moving[name], dtype=float)) for name, level in self._levels[first].items()}
+
     def _moving(self, frame: Frame) -> Mapping[str, np.ndarray]:
         still = self._still
         return without_still_light(self._light(frame), still) if still else self._light(frame)
@@ -259,12 +266,16 @@ class ShownParticles:
         """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
         if frame in self._recent:
             return self._recent[frame]
-        found = {}
+        found, levels = {}, {}
         for name, camera in self.cameras.items():
             raw = self.experiment.frame_image(name, frame)
-            found[name], _ = without_background(camera, raw, self._darks[name], frame)
-            if seen_structure(found[name], camera.decoder) < NOISE:
+            light, _ = without_background(camera, raw, self._darks[name], frame)
+            if seen_structure(light, camera.decoder) < NOISE:
                 raise ValueError("expected particles, found only noise")
+            mean = float(np.mean(light, dtype=float))
+            levels[name] = mean if mean > 0 else 1.0
+            found[name] = light * np.float32(1 / levels[name])
+        self._levels[frame] = levels
         kept = max(len(self.experiment.frames), KEPT_BYTES // sum(image.nbytes for image in found.values()))
         for old in list(self._recent)[: max(len(self._recent) + 1 - kept, 0)]:
             del self._recent[old]

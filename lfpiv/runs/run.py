@@ -35,6 +35,7 @@ from lfpiv.runs import bootstrap, guard, memory, odd_pairs, pair_figures, refine
 from lfpiv.runs.finished_pairs import FinishedPairs
 from lfpiv.runs.guard import Guard
 from lfpiv.runs.invocation import Calibrated, Invocation, Tried, Workers
+from lfpiv.runs.other_scales import other_scales
 from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.pending_pairs import PendingPairs
@@ -290,7 +291,7 @@ class Run:
         done = replace(
             done,
             reused=reused,
-            warnings=(*self.warnings, *self._reversed(contents)),
+            warnings=(*self.warnings, *self._unlike_pairs(contents)),
             workers=done.workers or Workers(count=1, threads=self.device.threads),
         )
         with writing(self.folder.pairs):
@@ -311,9 +312,9 @@ class Run:
         for pair in odd_pairs.settle(self.finished, self.files, make_work):
             self._keep(self.files(pair))
 
-    def _reversed(self, contents: Contents) -> list[Warning]:
-        """Log and return the warning about pairs whose flow runs against that of the others."""
-        found = reversed_pairs(contents.vectors)
+    def _unlike_pairs(self, contents: Contents) -> list[Warning]:
+        """Log and return the warnings about pairs whose flow runs against that of the others, or on another scale."""
+        found = [*reversed_pairs(contents.vectors), *other_scales(contents.vectors)]
         for warning in found:
             log.warning("%s", warning.sentence)
         return found

@@ -157,12 +157,16 @@ class CameraVolumes:
     def each(self, instants: int) -> list[CameraVolumes]:
         """Return the volumes of each run of so many instants alone."""
         count = len(next(iter(self._volumes.values())))
-        parts = []
-        for first in range(0, count, instants):
-            part = copy.copy(self)
-            part._volumes = {name: known[first : first + instants] for name, known in self._volumes.items()}
-            parts.append(part)
-        return parts
+        return [self._part(slice(first, first + instants)) for first in range(0, count, instants)]
+
+    def every(self, period: int) -> list[CameraVolumes]:
+        """Return the volumes of the first instants of each run of so many, of the second ones, and so on."""
+        return [self._part(slice(first, None, period)) for first in range(period)]
+
+    def _part(self, instants: slice) -> CameraVolumes:
+        part = copy.copy(self)
+        part._volumes = {name: known[instants] for name, known in self._volumes.items()}
+        return part
 
     def disparities(self) -> tuple[Disparity, ...]:
         """Measure the disparities of all pairs of cameras in the parts of the volume that have a clear peak.

@@ -173,6 +173,17 @@ class MovementFit:
         """Return the part of the movements within a projection."""
         return replace(self, values=projection @ self.values)
 
+    def since(self, other: MovementFit) -> MovementFit:
+        """Return the movements from those of another fit, of other images, to these."""
+        return replace(
+            self,
+            values=self.values - other.values,
+            covariance=self.covariance + other.covariance,
+            observed=(self.observed + other.observed) / 2,
+            freedom=min(self.freedom, other.freedom),
+            scatter_mm=float(np.hypot(self.scatter_mm, other.scatter_mm)),
+        )
+
     def share_in(self, other: MovementFit) -> float:
         """Return how much of these movements is in those of another fit: 1 if they are equal, -1 if opposite."""
         along = self.observed @ self.values

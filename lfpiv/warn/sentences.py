@@ -55,6 +55,7 @@ class Code(enum.Enum):
     LIGHT_UNGUARDED = "light_unguarded"
     COARSE_VOXELS = "coarse_voxels"
     APART = "apart"
+    MOVED_FRAMES = "moved_frames"
     NOTHING_IN_COMMON = "nothing_in_common"
     MISMATCHED = "mismatched"
     NOT_SELF_CALIBRATED = "not_self_calibrated"
@@ -70,6 +71,7 @@ class Code(enum.Enum):
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
     REVERSED = "reversed"
+    OTHER_SCALE = "other_scale"
     FEW_VECTORS = "few_vectors"
     CROWDED = "crowded"
     UNLINKED = "unlinked"
@@ -251,6 +253,11 @@ SENTENCES: Mapping[Code, str] = {
         "{used_mm:.3g} mm: expect more ghosts; raise compute.memory_gib or shrink volume.size_mm"
     ),
     Code.APART: "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: {cause}; {advice}.",
+    Code.MOVED_FRAMES: (
+        "beside the other cameras, the second frames show the particles {voxel:.1f} voxel from where the first frames "
+        "show them, {lenses:.1f} microlens in the image: the camera moved between its exposures, or {cause}. Vectors "
+        "are wrong by about as much; compare both frames of the camera where nothing moves"
+    ),
     Code.NOTHING_IN_COMMON: (
         "{names} show no particles in common within {search} voxels, so no vector is valid: a camera moved by more, "
         "their images are of different instants, or show very few particles."
@@ -296,6 +303,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.REVERSED: (
         "the flow runs against {others}: unless it turned, the frames of a pair are exchanged in every camera. Check "
         "the order of its images"
+    ),
+    Code.OTHER_SCALE: (
+        "the counts beside those of {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, "
+        "exposure, or the scale of the files changed. Each camera's scale is divided out in every pair, up to 25 times"
     ),
     Code.FEW_VECTORS: (
         "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "

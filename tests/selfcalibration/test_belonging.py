@@ -12,6 +12,7 @@ import lfpiv
 from lfpiv.calibration.camera import Calibration
 from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
+from lfpiv.runs.moved_cameras import ShownParticles
 from lfpiv.runs.reversed_pairs import reversed_pairs
 from lfpiv.selfcalibration.belonging import ImageFit, Judgement, judge
 from lfpiv.selfcalibration.mistakes import FLIPS, Kind, Mistake
@@ -168,6 +169,19 @@ def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_pa
     assert not found.refusals
     (said,) = [text for text in caplog.messages if "times the counts of right" in text]
     assert 12 < float(said.split(" have ")[1].split()[0]) < 20  # the cameras are not equally bright
+
+
+@pytest.mark.slow(but="16")
+@pytest.mark.parametrize("ratio", [16, 1 / 16])
+def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tmp_path, ratio):
+    """Images of other pairs, on the usual scale, are the measure of chance and of the light that stands still."""
+    file = small_run.images(tmp_path / "data")
+    for path in sorted((file.parent / "particles" / "left").iterdir())[:2]:
+        tifffile.imwrite(path, tifffile.imread(path) * np.float32(ratio))
+    experiment, weights = lfpiv.open_experiment(file), rig[1]
+    shown = ShownParticles(experiment, weights.cameras, [0, 1, 2])
+    assert not belonging.refusals_of(shown, ImageFit(weights), 0)
+    assert belonging.check(experiment, weights, [0]).sentence == belonging.check(rig[0], weights, [0]).sentence
 
 
 @pytest.mark.slow
