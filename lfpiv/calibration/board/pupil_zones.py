@@ -8,9 +8,11 @@ eliminated, is summed over the dots of a part of the field: this is the displace
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from lfpiv.calibration.board.dot_fit import DotFit
 from lfpiv.calibration.board.dot_model import ZONES, zone_middles, zone_shares
@@ -24,6 +26,8 @@ _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
 _CLEAR = 1.5  # root mean square over the zones of displacements in standard errors that is told; 1 by chance
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
+
+_ROUNDING = 1e-6  # least variance of a common displacement, as a share of the largest
 
 
 def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> np.ndarray:
@@ -55,29 +59,45 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
         if len(here) < _FEWEST:
             continue
         mean, scatter, noise = _displacement(pull[here], information[here], pitch_mm)
-        size, limit = (np.linalg.norm(one, axis=1) for one in (mean, np.maximum(scatter, noise)))
+        error = np.sqrt(np.maximum(np.diag(scatter), np.diag(noise)))
+        size, limit = (np.linalg.norm(one.reshape(2, ZONES), axis=0) for one in (mean, error))
         sure = float(np.sqrt(np.mean((size / limit) ** 2))) > _CLEAR
         clear |= sure and bool(size.max() > _LEAST_PITCHES * pitch_mm)
         if part < PARTS:
-            found[part] = mean
+            found[part] = mean.reshape(2, ZONES).T
     return found if clear else np.zeros_like(found)
 
 
 def shared_error(fits: Sequence[DotFit], left_over_mm: np.ndarray, pitch_mm: float) -> float:
     """Return the mean displacement of rays beside the ray models of all dots [mm], within `INNER` of the pupil.
 
-    Unlike `left_over` it is a best estimate, not a proof: the displacement of each zone over the whole field, less what
-    the scatter of the dots makes of it. Where `left_over` is sure, its displacements count, by part of the field.
+    Unlike `left_over` it is a best estimate, not a proof. Displacements of the zones over the whole field are taken as
+    normal about zero, of the most likely variance beside their errors [1]_. Where `left_over` is sure, its
+    displacements count, by part of the field.
+
+    References
+    ----------
+    .. [1] R. J. Hardy, S. G. Thompson, "A likelihood approach to meta-analysis with random effects", Statist. Med. 15
+       (1996) 619-629, doi:10.1002/(SICI)1097-0258(19960330)15:6<619::AID-SIM188>3.0.CO;2-A.
     """
     inner = np.linalg.norm(zone_middles(), axis=1) < INNER
-    shares = zone_shares()[inner] / zone_shares()[inner].sum()
     if left_over_mm.any():
+        shares = zone_shares()[inner] / zone_shares()[inner].sum()
         return float((np.linalg.norm(left_over_mm[:, inner], axis=-1) @ shares).mean())
     if len(fits) < _FEWEST:
         return 0.0
     mean, scatter, _ = _displacement(*_equations(fits), pitch_mm)
-    square = (mean**2).sum(1) - (scatter**2).sum(1)
-    return float(np.sqrt(np.maximum(square, 0))[inner] @ shares)
+    inner = np.tile(inner, 2)
+    variance, axes = np.linalg.eigh(scatter[inner][:, inner])
+    variance, square = np.maximum(variance, _ROUNDING * variance[-1]), (axes.T @ mean[inner]) ** 2
+
+    def unlikely(log_of: float) -> float:
+        total = np.exp(log_of) + variance
+        return float((np.log(total) + square / total).sum())
+
+    lowest = np.log(variance[0])
+    found = minimize_scalar(unlikely, bounds=(lowest, 2 * np.log(_PRIOR_PITCHES * pitch_mm)), method="bounded")
+    return math.sqrt(math.pi / 2 * math.exp(found.x)) if found.x > lowest + 1 else 0.0
 
 
 def _equations(fits: Sequence[DotFit]) -> tuple[np.ndarray, np.ndarray]:
@@ -91,19 +111,15 @@ def _equations(fits: Sequence[DotFit]) -> tuple[np.ndarray, np.ndarray]:
 def _displacement(
     pull: np.ndarray, information: np.ndarray, pitch_mm: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the displacement that dots have in common, and two standard errors of it, shape (ZONES, 2) [mm].
+    """Return the displacement that dots have in common, shape (2 ZONES,) [mm], and two covariances of it [mm^2].
 
     The first is the scatter of the dots, which includes errors of their model. The second is what their pixels' noise
     makes of it: a zone that few dots light scatters too little.
     """
     inverse = np.linalg.inv(information.sum(0) + np.eye(2 * ZONES) / (_PRIOR_PITCHES * pitch_mm) ** 2)
     mean = inverse @ pull.sum(0)
-    scatter = (((pull - information @ mean) @ inverse) ** 2).sum(0) * len(pull) / (len(pull) - 1)
-    return (
-        mean.reshape(2, ZONES).T,
-        np.sqrt(scatter).reshape(2, ZONES).T,
-        np.sqrt(np.diag(inverse)).reshape(2, ZONES).T,
-    )
+    each = (pull - information @ mean) @ inverse
+    return mean, each.T @ each * len(pull) / (len(pull) - 1), inverse
 
 
 def worst(displacement_mm: np.ndarray) -> tuple[float, tuple[float, float]]:
