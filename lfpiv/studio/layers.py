@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pyvista as pv
 import xarray as xr
@@ -31,7 +33,8 @@ def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
 
 def grid_of(vectors: xr.Dataset) -> pv.ImageData:
     """Return vectors and what is derived of them as point data on an even grid [mm]."""
-    vectors = vectors.load()
+    with ThreadPoolExecutor(1) as here:  # dask, where it is installed, would import its clusters to find none
+        vectors = vectors.load(scheduler=here)
     axes = [np.asarray(vectors[axis], float) for axis in "xyz"]
     steps = [np.ptp(axis) / (len(axis) - 1) if len(axis) > 1 else 1.0 for axis in axes]
     grid = pv.ImageData(dimensions=[len(axis) for axis in axes], spacing=steps, origin=[axis[0] for axis in axes])

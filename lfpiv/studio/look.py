@@ -191,15 +191,14 @@ class Picture:
         plotter.add_mesh(grid.outline(), color=ink, name="outline", reset_camera=False, render=False)
         plotter.remove_bounds_axes()
         sides = np.ptp(np.reshape(grid.bounds, (3, 2)), axis=1)
-        ticks = np.digitize(sides / sides.max(), TICKS)
-        x, y, z = ticks.tolist()
+        x, y, z = ticks = np.digitize(sides / sides.max(), TICKS).tolist()
         axes = plotter.show_bounds(
             bounds=grid.bounds, color=ink, xtitle="x [mm]", ytitle="y [mm]", ztitle="z [mm]", font_size=11, grid=False,
             location="outer", n_xlabels=x + 1, n_ylabels=y + 1, n_zlabels=z + 1, show_xlabels=x > 0, show_ylabels=y > 0,
             show_zlabels=z > 0, ticks="outside", fmt="%.3g", use_3d_text=False, render=False,
         )  # fmt: skip
-        for number in np.flatnonzero(ticks == len(TICKS)):
-            axes.SetAxisLabels(number, None)  # VTK's own, at round numbers, are too many on short sides
+        for axis in [axis for axis in range(3) if ticks[axis] == len(TICKS)]:
+            axes.SetAxisLabels(axis, None)  # VTK's own, at round numbers, are too many on short sides
         if plotter.scalar_bars:
             plotter.remove_scalar_bar(render=False)
         scale = pv.DataSetMapper()

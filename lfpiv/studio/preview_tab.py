@@ -161,9 +161,9 @@ class Preview:
 
     async def _ask(self, arguments: list[str], text: str) -> list[str]:
         """Call Python with arguments, and a text as its standard input; return the lines of its standard output."""
-        process = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdin=PIPE, stdout=PIPE, stderr=PIPE)
-        out, err = await process.communicate(text.encode())
-        if process.returncode:
+        child = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdin=PIPE, stdout=PIPE, stderr=PIPE)
+        out, err = await child.communicate(text.encode())
+        if child.returncode:
             raise InputError((err.decode().splitlines() or [f"{arguments[1]}: ended without an answer."])[-1])
         return out.decode().splitlines()
 

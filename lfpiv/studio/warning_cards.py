@@ -23,8 +23,6 @@ FIGURE = re.compile(r"\{[^}]*\}")
 PARTS = re.compile(r"((?:\([^)]*\)|.)*?(?:[;.] |: (?=check|look)|$))(.*)", re.DOTALL)
 """What a sentence says, up to the first stop outside brackets, and what to do."""
 REGION = ("left", "top", "right", "bottom")
-PAGE = "troubleshooting"
-"""Page of warnings and their remedies; it is shipped with the package."""
 
 
 def card(record: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
@@ -49,7 +47,8 @@ def card(record: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     camera = next((name for name in cameras if re.match(rf"{re.escape(name)}([,:]|$)", named)), "")
     region = [int(figures[name]) for name in REGION] if all(name in figures for name in REGION) else []
     place = {"camera": camera, "image": _image(code, text, record), "region": region} if camera else None
-    return {"what": what.rstrip(" ;:"), "remedy": remedy, "code": code, "place": place, "link": f"pages/{PAGE}#{code}"}
+    link = f"pages/troubleshooting#{code}"
+    return {"what": what.rstrip(" ;:"), "remedy": remedy, "code": code, "place": place, "link": link}
 
 
 def _code_of(text: str) -> str:
