@@ -14,6 +14,7 @@ from functools import reduce
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
+from lfpiv.lightfield.image_checks import dark_blocks
 from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
@@ -106,7 +107,7 @@ def refusals_of(shown: ShownParticles, fit: ImageFit, pair: int) -> list[Warning
     experiment, names = shown.experiment, list(shown.cameras)
     try:
         light = shown.pair(pair)
-        found = judge(fit, shown, pair, *_shifts(experiment, pair), images=_images(experiment), thorough=True)
+        found = _judgement(shown, fit, pair, thorough=True)
     except ValueError as error:  # its images were there before
         log.debug("images of %s are not compared: %s", experiment.name_of(pair), error)
         return []
@@ -196,14 +197,34 @@ def _judge(shown: ShownParticles, pairs: Sequence[int], weights: Weights) -> dic
     fit, judged = ImageFit(weights), dict[int, Judgement]()
     for pair in pairs:
         try:
-            shown.pair(pair)
-            judged[pair] = judge(fit, shown, pair, *_shifts(shown.experiment, pair), images=_images(shown.experiment))
+            judged[pair] = _judgement(shown, fit, pair)
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
             log.debug("images of %s are not compared: %s", shown.experiment.name_of(pair), error)
             continue
         if judged[pair].fits and not judged[pair].doubted:
             break
     return judged
+
+
+def _judgement(shown: ShownParticles, fit: ImageFit, pair: int, *, thorough: bool = False) -> Judgement:
+    """Judge a pair; raise ValueError if its images cannot be used.
+
+    A frame that is dark in part fits no other camera. So the other frame alone may show that images belong together.
+    """
+    light, experiment = shown.pair(pair), shown.experiment
+    shifts, images = _shifts(experiment, pair), _images(experiment)
+    found = judge(fit, shown, pair, *shifts, images=images, thorough=thorough)
+    if found.fits or not any(dark_blocks(*(frame[name] for frame in light)) for name in shown.cameras):
+        return found
+    for whole in (0, 1):
+
+        def repeated(number: int, frame: int, whole: int = whole) -> Images | None:
+            return shown(number, whole if number == pair else frame)
+
+        alone = judge(fit, repeated, pair, *shifts, images=images, thorough=thorough)
+        if not alone.mistakes and alone.over_chance > SURE:
+            return alone
+    return found
 
 
 def _shifts(experiment: Experiment, pair: int) -> tuple[Sequence[int], Sequence[int]]:

@@ -184,6 +184,21 @@ def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tm
     assert belonging.check(experiment, weights, [0]).sentence == belonging.check(rig[0], weights, [0]).sentence
 
 
+@pytest.mark.parametrize("foreign", [False, True])
+def test_a_pair_with_a_frame_that_is_half_dark_is_judged_by_the_other_frame(rig, small_run, tmp_path, foreign):
+    file = small_run.images(tmp_path / "data")
+    left, right = (sorted((file.parent / "particles" / name).iterdir()) for name in ("left", "right"))
+    if foreign:
+        for own, other in zip(left[:2], left[4:6], strict=True):
+            own.write_bytes(other.read_bytes())
+    image = tifffile.imread(right[1])
+    image[: len(image) // 2] = np.percentile(image, 1)
+    tifffile.imwrite(right[1], image)
+    experiment, weights = lfpiv.open_experiment(file), rig[1]
+    shown = ShownParticles(experiment, weights.cameras, [0, 1, 3])
+    assert bool(belonging.refusals_of(shown, ImageFit(weights), 0)) is foreign
+
+
 @pytest.mark.slow
 def test_scales_that_cannot_be_divided_out_are_named_in_place_of_other_mistakes(rig, small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
