@@ -194,11 +194,11 @@ def _report(experiment: ExperimentFile, out: Out) -> None:
 def _export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run: its --out.")],
     to: Annotated[
-        Literal["vti", "netcdf", "zarr", "csv", "vtp", "pivpy"],
+        Literal["vti", "netcdf", "zarr", "csv", "tecplot", "vtp", "pivpy"],
         typer.Option(
             "--to",
-            help="ParaView images; one NetCDF or Zarr file of all vectors; tables; particles for ParaView; planes for "
-            "pivpy.",
+            help="ParaView images; one NetCDF or Zarr file of all vectors; tables; text for Tecplot; particles for "
+            "ParaView; planes for pivpy.",
         ),
     ],
     out: Annotated[
@@ -217,7 +217,7 @@ def _export(
         ),
     ] = None,
 ) -> None:
-    """Write the vectors of a run for other programs: ParaView, xarray, spreadsheets, pivpy."""
+    """Write the vectors of a run for other programs: ParaView, xarray, spreadsheets, Tecplot, pivpy."""
     selected = terminal.parse_pairs(pairs)
     with _output.progress() as progress:
         from lfpiv.results.export import export

@@ -1,4 +1,4 @@
-"""`export_results`: write vectors of a run in formats of other programs: ParaView (vti), NetCDF, Zarr, CSV, pivpy.
+"""`export_results`: write vectors of a run in formats of other programs: ParaView, NetCDF, Zarr, CSV, Tecplot, pivpy.
 
 A file appears under its name only when it is complete. Existing files are replaced as a whole.
 """
@@ -53,6 +53,7 @@ class Format(enum.Enum):
     NETCDF = "vectors.nc, one NetCDF4 file of all pairs or instants: xarray, MATLAB"
     ZARR = "vectors.zarr, one Zarr store of all pairs or instants: xarray, dask"
     CSV = "a table per pair or instant, a row per vector; of its linked particles; of all tracks; with units"
+    TECPLOT = "one .dat file of Tecplot's text per pair or instant"
     VTP = "one .vtp file of linked particles per pair or instant, with a .pvd collection; one of tracks: ParaView"
     PIVPY = "one NetCDF file per depth, planes of u and v of all pairs or instants: pivpy"
 
@@ -73,7 +74,7 @@ def export_results(
     ----------
     folder : str or Path
         Folder of the run.
-    to : {"vti", "netcdf", "zarr", "csv", "vtp", "pivpy"}
+    to : {"vti", "netcdf", "zarr", "csv", "tecplot", "vtp", "pivpy"}
         The format, see `Format` and docs/conventions.md.
     out : str or Path, optional
         Folder to write to. Default: `FOLDER` inside `folder`.
@@ -82,8 +83,8 @@ def export_results(
     depth_mm : float, optional
         For "pivpy": only the plane of vectors nearest to this z [mm]. Default: all planes.
     interval_s : float, optional
-        Time between the first frames of successive pairs [s], which makes times in "vti", "netcdf", "zarr" and "pivpy"
-        seconds. Default: the number of the pair is used as time. The times of a time series are known.
+        Time between the first frames of successive pairs [s], which makes times in "vti", "netcdf", "zarr", "tecplot"
+        and "pivpy" seconds. Default: the number of the pair is used as time. The times of a time series are known.
     progress : callable, optional
         Called as ``progress("export", fraction)``.
 
@@ -165,6 +166,8 @@ def export(
                 written = _write_stacked(form, files, target, interval_s, step)
             elif form is Format.CSV:
                 written = _write_tables(results, tables, Path(folder), target, step)
+            elif form is Format.TECPLOT:
+                written = _write_tecplot(results, target, interval_s, step)
             elif form is Format.VTP:
                 written = _write_vtp(tables, Path(folder), target, _times_by_number(results, interval_s))
             else:
@@ -351,6 +354,14 @@ def _write_csv(results: xr.Dataset, target: Path, progress: StepProgress) -> lis
     for pair, vectors in _each_pair(results, progress):
         written.append(target / f"{_stem(results, pair)}.csv")
         csv_tables.write_vectors(vectors, written[-1])
+    return written
+
+
+def _write_tecplot(results: xr.Dataset, target: Path, interval_s: float | None, progress: StepProgress) -> list[Path]:
+    times, written = _times_by_number(results, interval_s), []
+    for number, vectors in _each_pair(results, progress):
+        written.append(target / f"{_stem(results, number)}.dat")
+        csv_tables.write_tecplot(vectors, written[-1], times[number])
     return written
 
 

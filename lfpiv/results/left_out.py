@@ -61,6 +61,10 @@ def of_export(
     if to == "pivpy":
         others = tuple(str(name) for name in results.data_vars if name not in pivpy_planes.VARIABLES)
         yield LeftOut(others, "pivpy has no place for them: netcdf, zarr, csv and vti have them")
+    if to == "tecplot" and (
+        gaps := tuple(f"NaN of {name}" for name, one in results.data_vars.items() if one.isnull().any())
+    ):
+        yield LeftOut(gaps, "Tecplot's text has none: 0 stands there")
     if to == "vtp":
         yield LeftOut(tuple(map(str, results.data_vars)), "this format is of particles: vti has the vectors")
     if with_particles and to not in ("csv", "vtp"):

@@ -1,9 +1,10 @@
-"""CSV tables of vectors, and the description of all tables in a folder.
+"""Tables of vectors as CSV and for Tecplot, and the description of all CSV tables in a folder.
 
 A table has a header and nothing before it, so that every program reads it. What the columns are, and when and by which
 program tables were written, is in ``csv-metadata.json`` beside them, in the form of the W3C's "CSV on the Web" [1]_.
 
 .. [1] https://www.w3.org/TR/tabular-metadata/
+.. [2] Tecplot, Inc., "Tecplot 360 Data Format Guide", chapter 4, ASCII data
 """
 
 from __future__ import annotations
@@ -33,6 +34,24 @@ def write_vectors(vectors: xr.Dataset, path: Path) -> None:
     """Write vectors (z, y, x) as text, a row per vector, as of `write_columns`."""
     rows = vectors.to_dataframe(dim_order=list(AXES)).reset_index()
     write_columns(rows, path, {name: about["units"] for name, about in columns_of(vectors).items()})
+
+
+def write_tecplot(vectors: xr.Dataset, path: Path, time: float) -> None:
+    """Write vectors (z, y, x) as an ordered zone of Tecplot's text [2]_, atomically; 0 stands for NaN.
+
+    Readers know coordinates by their plain names, so the title has their unit.
+    """
+    rows, columns = vectors.to_dataframe(dim_order=list(AXES)).reset_index(), columns_of(vectors)
+    units = {name: "1" if name in AXES else about["units"] for name, about in columns.items()}
+    titles = " ".join(f'"{title(name, unit)}"' for name, unit in units.items())
+    size = ", ".join(f"{letter}={vectors.sizes[axis]}" for letter, axis in zip("IJK", "xyz", strict=True))
+    zone = f'ZONE T="{path.stem}", {size}, DATAPACKING=POINT, STRANDID=1, SOLUTIONTIME={time:.{DIGITS}g}'
+    rows = rows[list(columns)].fillna(0).astype({name: np.uint8 for name in columns if rows[name].dtype == bool})
+    with replacing(path) as scratch:
+        text = rows.to_csv(sep=" ", index=False, header=False, float_format=f"%.{DIGITS}g")
+        scratch.write_text(
+            f'TITLE="{path.stem}, x, y, z in {columns["x"]["units"]}"\nVARIABLES={titles}\n{zone}\n{text}', "utf-8"
+        )
 
 
 def write_columns(rows: pd.DataFrame, path: Path, units: Mapping[str, str]) -> None:

@@ -104,6 +104,31 @@ def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     assert f"{names}: left out, made with other settings" in caplog.text and "--keep-volumes" in caplog.text
 
 
+def test_tecplots_text_holds_the_vectors_at_their_places(run, tmp_path):
+    """A reader of another program finds an ordered zone; it does not read times, and writes _ for /."""
+    pyvista = pytest.importorskip("pyvista")
+    folder, written = run
+    paths = lfpiv.export_results(folder, "tecplot", out=tmp_path, interval_s=INTERVAL_S)
+    assert [path.name for path in paths] == [f"pair_{number:04d}.dat" for number in NUMBERS]
+    for number, path in zip(NUMBERS, paths, strict=True):
+        assert f"SOLUTIONTIME={INTERVAL_S * number:g}\n" in path.read_text()
+        zone, vectors = pyvista.get_reader(path).read()[0], written[number]
+        z, y, x = np.meshgrid(*(vectors[axis] for axis in "zyx"), indexing="ij")
+        assert np.allclose(np.asarray(zone.points).reshape(*x.shape, 3), np.stack([x, y, z], -1), rtol=SINGLE)
+        for title, name in (("u [m_s]", "u"), ("displacement_z [voxel]", "displacement_z"), ("valid", "valid")):
+            np.testing.assert_allclose(at_points(zone, title), vectors[name], rtol=SINGLE)
+
+
+def test_tecplots_text_has_no_nan_and_says_so(tmp_path):
+    (vectors,) = write_run(tmp_path, [0]).values()
+    gap = vectors.copy(deep=True)
+    gap["uncertainty"].values[0, 1, 2] = np.nan
+    netcdf.write_vectors(gap, tmp_path / "vectors" / "pair_0000.nc", attributes={"pair": 0})
+    done = export.export(tmp_path, "tecplot")
+    assert "nan" not in done.files[0].read_text().lower()
+    assert [one.what for one in done.left_out] == [("NaN of uncertainty",)]
+
+
 def test_planes_have_the_form_pivpy_reads(run, tmp_path):
     folder, written = run
     paths = lfpiv.export_results(folder, "pivpy", out=tmp_path)
@@ -146,7 +171,7 @@ def test_pivpy_computes_with_the_planes(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"to": "xlsx"}, "to: expected one of vti, netcdf, zarr, csv, vtp, pivpy, found 'xlsx'"),
+        ({"to": "xlsx"}, "to: expected one of vti, netcdf, zarr, csv, tecplot, vtp, pivpy, found 'xlsx'"),
         ({"to": "csv", "depth_mm": 0.0}, "depth: expected with pivpy only"),
         ({"to": "pivpy", "depth_mm": 9.0}, "depth: expected a z among the vectors, -1 to 0.8 mm, found 9 mm"),
         ({"to": "pivpy", "depth_mm": float("nan")}, "depth: .*found nan"),
@@ -163,7 +188,7 @@ def test_bad_arguments_are_one_message_and_leave_nothing(run, tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("to", ["vti", "netcdf", "csv", "pivpy"])
+@pytest.mark.parametrize("to", ["vti", "netcdf", "csv", "tecplot", "pivpy"])
 def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     folder, _ = run
     (tmp_path / "new").mkdir()
@@ -218,6 +243,8 @@ def test_what_an_export_leaves_out_is_logged_and_in_the_result(to, tmp_path, cap
         assert b"vorticity" not in image and b"velocity" in image
     elif to == "pivpy":
         assert set(named) == set(netcdf.VECTOR_UNITS) - {"u", "v", "w", "valid"}
+    elif to == "tecplot":
+        assert set(named) == {"NaN of uncertainty"}
     else:
         assert not named
     assert all(name in said.err for name in named)
