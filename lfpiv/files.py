@@ -162,6 +162,11 @@ def writing(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
+        if isinstance(error, FileNotFoundError) and not path.parent.exists():
+            raise StorageError(
+                f"{path}: cannot be written: its folder was removed or renamed meanwhile, with what it held. Put it "
+                "back, or run the command again."
+            ) from error
         free = ""
         with contextlib.suppress(OSError):
             free = f", {shutil.disk_usage(path.parent).free / MIB:,.0f} MiB free there"

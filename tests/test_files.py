@@ -10,6 +10,7 @@ import pytest
 
 import lfpiv
 from lfpiv import files
+from lfpiv.errors import StorageError
 from lfpiv.settings.processing import Smart
 
 
@@ -22,6 +23,15 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
         scratch.write_text("half")
         raise RuntimeError
     assert path.read_text() == old and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_was_removed_meanwhile_is_named_and_nothing_said_to_be_complete(tmp_path):
+    path = tmp_path / "results" / "report.html"
+    with pytest.raises(StorageError, match="its folder was removed or renamed") as caught, files.writing(path):
+        path.write_text("new")
+    assert "complete" not in str(caught.value)
+    with pytest.raises(StorageError, match="Finished results are complete"), files.writing(path):
+        raise OSError(28, "No space left on device")
 
 
 @pytest.mark.parametrize(("write", "content"), [("write_bytes", b"new"), ("write_text", "new"), ("write_json", "new")])
