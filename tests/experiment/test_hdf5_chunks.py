@@ -100,6 +100,13 @@ def test_chunks_are_read_as_hdf5_reads_them(tmp_path, options, kind):
         np.testing.assert_array_equal(read(tmp_path / "run.h5", number), frame)
 
 
+def test_a_chunk_that_szip_would_make_larger_is_stored_plain(tmp_path):
+    noise = np.random.default_rng(8).integers(0, 256, FRAMES.shape, np.uint8)
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file.create_dataset("images", data=noise, chunks=(1, 21, 35), compression="szip")
+    np.testing.assert_array_equal(read(tmp_path / "run.h5", 1), noise[1])
+
+
 def test_filters_of_hdf5plugin_are_read(tmp_path):
     plugin = pytest.importorskip("hdf5plugin")
     for number, options in enumerate(

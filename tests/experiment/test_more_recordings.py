@@ -72,6 +72,15 @@ def test_images_of_an_uncompressed_avi_are_numbered(tmp_path, options):
     refuse(tmp_path / "run.avi", "5 images, none of them #5", 5)
 
 
+def test_an_image_that_was_dropped_keeps_its_number(tmp_path):
+    """Else all later images would be an instant early beside the other cameras."""
+    frames = (FRAMES >> 4).astype(np.uint8)
+    write_avi(tmp_path / "run.avi", frames, dropped=(2,))
+    for number in (0, 1, 3, 4):
+        np.testing.assert_array_equal(read(tmp_path / "run.avi", number), frames[number])
+    refuse(tmp_path / "run.avi", "image 2 was dropped", 2)
+
+
 def test_avi_images_of_16_bits_are_read(tmp_path):
     write_avi(tmp_path / "run.avi", FRAMES, code=b"Y16 ", bits=16, palette=False)
     np.testing.assert_array_equal(read(tmp_path / "run.avi", 3), FRAMES[3])

@@ -3,8 +3,10 @@
 import os
 import socket
 import struct
+import subprocess
 import sys
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,6 +27,8 @@ COUNT, ROWS, COLUMNS = 5, 12, 20
 LABEL = "particles.images, camera 'left'"
 LINEAR_COUNTS = {0: 2, 1: 5, 64: 64, 160: 156, 512: 998, 1000: 3947, 1014: 4064, 1023: 4095}
 """Counts of some packed 10-bit codes, from the table of "Cine File Format"."""
+ORIENTATION = 274
+"""Number of the TIFF tag."""
 
 
 @pytest.fixture
@@ -152,6 +156,16 @@ def test_images_of_an_mraw_are_numbered(tmp_path, frames, header, bits, dtype):
     stored = (frames >> (4 if bits == 8 else 0)).astype(dtype)
     write_mraw(tmp_path / "run_C001H001S0001.mraw", stored, bits, header=header)
     require_numbered(tmp_path / "run_C001H001S0001.mraw", stored)
+
+
+@pytest.mark.parametrize("line", ["{}:{}", "{}\t:\t{}\r"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_the_text_header_of_an_mraw_needs_no_certain_blanks(tmp_path, frames, line, mark):
+    write_mraw(tmp_path / "run.mraw", frames)
+    entries = {"Total Frame": COUNT, "Image Width": COLUMNS, "Image Height": ROWS, "Color Bit": 16, "Time": "12:30"}
+    text = mark + "\n".join(line.format(key, value) for key, value in entries.items())
+    (tmp_path / "run.cih").write_bytes(text.encode())
+    require_numbered(tmp_path / "run.mraw", frames)
 
 
 @pytest.mark.parametrize("options", [{}, {"extended": False}, {"comment": b"laser 2"}], ids=str)
@@ -438,3 +452,39 @@ def test_a_png_has_one_image(tmp_path, frames):
     (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(frames[0]))
     np.testing.assert_array_equal(read(tmp_path / "a.png", "#0"), frames[0])
     refuse(tmp_path / "a.png", "#1", "1 image, none of them #1")
+
+
+def test_a_grey_value_of_a_png_may_be_named_as_transparent(tmp_path, frames):
+    whole = imagecodecs.png_encode(frames[0])
+    content = b"tRNS" + frames[0, 0, :1].astype(">u2").tobytes()
+    chunk = struct.pack(">I", 2) + content + struct.pack(">I", zlib.crc32(content))
+    (tmp_path / "a.png").write_bytes(whole[:33] + chunk + whole[33:])  # behind signature and header
+    np.testing.assert_array_equal(read(tmp_path / "a.png", ""), frames[0])
+
+
+@pytest.mark.parametrize("turned", range(2, 9))
+def test_a_tiff_that_is_shown_turned_is_refused(tmp_path, frames, turned):
+    """Programs differ in whether they obey the tag, so nobody knows how the picture lies."""
+    tags = [(ORIENTATION, "H", 1, turned, True)]
+    tifffile.imwrite(tmp_path / "a.tif", frames[0], photometric="minisblack", extratags=tags)
+    refuse(tmp_path / "a.tif", "", f"tag Orientation is {turned}")
+
+
+def test_a_recording_of_no_images_is_named(tmp_path):
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file.create_dataset("images", (0, ROWS, COLUMNS), np.uint16, maxshape=(None, ROWS, COLUMNS))
+    write_mraw(tmp_path / "run.mraw", np.zeros((0, ROWS, COLUMNS), np.uint16))
+    for name in ("run.h5", "run.mraw"):
+        refuse(tmp_path / name, "", "of no images: nothing was recorded")
+
+
+def test_a_damaged_tiff_ends_in_one_message(tmp_path):
+    """The library logs what it finds, too; without a handler that is printed."""
+    (tmp_path / "a.tif").write_bytes(b"II" + struct.pack("<HIHHHIII", 42, 8, 1, 256, 99, 1, 5, 0))
+    code = (
+        "import sys; from pathlib import Path; from lfpiv.experiment import images; sys.tracebacklimit = 0; "
+        "images.read_image(Path(sys.argv[1]), 'test')"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "a.tif")]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert len(found.stderr.splitlines()) == 1 and "truncated or damaged" in found.stderr

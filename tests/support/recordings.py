@@ -77,7 +77,8 @@ def write_mraw(path, frames, bits=16, *, header="cih", **entries):
     path.write_bytes(b"".join(_mraw_pixels(frame, bits) for frame in frames))
     if header == "cihx":
         text = (
-            "<cih><fileInfo><date>2026/1/1</date></fileInfo><deviceInfo><deviceName>FASTCAM</deviceName></deviceInfo>"
+            "<cih><fileInfo><date>2026/1/1</date></fileInfo><deviceInfo><deviceName>FASTCAM</deviceName><sensor><width>4"
+            "</width><height>4</height></sensor></deviceInfo><displayInfo><type>LUT</type><bit>8</bit></displayInfo>"
             f"<frameInfo><totalFrame>{count}</totalFrame></frameInfo><imageDataInfo><resolution><width>{columns}</width>"
             f"<height>{rows}</height></resolution><colorInfo><type>Mono</type><bit>{bits}</bit></colorInfo>"
             "<effectiveBit><depth>12</depth><side>Lower</side></effectiveBit></imageDataInfo>"
@@ -140,7 +141,7 @@ def write_seq(path, frames, *, version=5, bits=None, interval_s=0.01, filling=40
             file.write(times.pack(*parts[: 3 if version >= 5 else 2]) + b"\xff" * filling)
 
 
-def write_avi(path, frames, *, code=bytes(4), bits=8, palette=True, top_down=False, parts=1):
+def write_avi(path, frames, *, code=bytes(4), bits=8, palette=True, top_down=False, parts=1, dropped=()):
     """Write an uncompressed ``.avi`` of bitmaps, or of a grey code whose rows are stored from the top.
 
     Parameters
@@ -157,6 +158,8 @@ def write_avi(path, frames, *, code=bytes(4), bits=8, palette=True, top_down=Fal
         Whether rows are stored from the top.
     parts : int
         Number of RIFF parts over which images are spread.
+    dropped : collection of int
+        Images whose chunks are empty.
     """
     frames = np.asarray(frames)
     count, rows, columns = frames.shape
@@ -170,9 +173,10 @@ def write_avi(path, frames, *, code=bytes(4), bits=8, palette=True, top_down=Fal
     head = _chunk(b"avih", bytes(56)) + _list(b"strl", sound) + _list(b"strl", stream)
     from_top = top_down or code.strip(b"\0") not in (b"", b"DIB ")
     images = []
-    for frame in frames:
+    for number, frame in enumerate(frames):
         stored = np.ascontiguousarray(frame if from_top else frame[::-1]).view(np.uint8).reshape(rows, -1)
-        images.append(_chunk(b"00db", np.pad(stored, ((0, 0), (0, -stored.shape[1] % 4))).tobytes()))
+        filled = np.pad(stored, ((0, 0), (0, -stored.shape[1] % 4))).tobytes()
+        images.append(_chunk(b"00db", b"" if number in dropped else filled))
     share = -(-count // parts)
     split = [b"".join(images[at : at + share]) for at in range(0, count, share)]
     first = _list(b"hdrl", head) + _chunk(b"JUNK", bytes(11)) + _list(b"movi", split[0]) + _chunk(b"idx1", bytes(16))

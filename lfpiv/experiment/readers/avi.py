@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from lfpiv.experiment.readers.source import ImagePath, NotOneImage
+from lfpiv.experiment.readers.source import ImagePath, NoSuchImage, NotOneImage
 from lfpiv.experiment.readers.stack import Frames
 
 GREY_CODES = {b"Y800": 8, b"Y8  ": 8, b"GREY": 8, b"Y16 ": 16}
@@ -43,6 +43,8 @@ class Avi(Frames):
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of an image's pixels."""
         start, length = self._places[number]
+        if length == 0:
+            raise NoSuchImage(f"none, since image {number} was dropped while the file was written")
         if length not in self._lengths:
             raise ValueError(f"image {number} has {length} bytes, expected {self._lengths[0]}")
         return start, length
@@ -62,7 +64,7 @@ def _found(image: ImagePath) -> tuple[bytes, list[tuple[int, int]]]:
                 is_video = stream.read(4) == b"vids"
             elif name == b"strf" and is_video and not form:
                 form = stream.read(min(length, _BITMAP.size + len(GREYS)))
-            elif name[2:] in (b"db", b"dc") and length:
+            elif name[2:] in (b"db", b"dc"):
                 places.append((start, length))
     return form, places
 

@@ -71,6 +71,8 @@ class Hdf5Images:
             return None
         if len(shape) != 3:
             raise NotOneImage(f"a dataset {name} of shape {shape}, not (image, row, column) or (row, column)")
+        if shape[0] == 0:
+            raise NoSuchImage(f"a dataset {name} of no images: nothing was recorded")
         if number is None and shape[0] != 1:
             raise NotOneImage(f"{shape[0]} images; name one behind the file: #{name}[0] to #{name}[{shape[0] - 1}]")
         if (number or 0) >= shape[0]:
@@ -174,5 +176,5 @@ def _checked(dataset: h5py.Dataset, number: int | None) -> Header:
         require_filters(dataset)
         require_written(dataset, number)
     if stored == 0:
-        raise ValueError(f"the dataset {dataset.name} has no pixels")
+        raise NoSuchImage(f"none, since the dataset {dataset.name} was never written: it has no pixels")
     return Header((int(shape[0]), int(shape[1])), dataset.dtype.name)

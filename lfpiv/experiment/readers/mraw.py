@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,16 +16,17 @@ HEADER_BYTES = 1 << 20
 """Largest part of a header that is read [byte]."""
 
 _XML_KEYS = {
-    "Total Frame": "totalFrame",
-    "Image Width": "width",
-    "Image Height": "height",
-    "Color Bit": "bit",
-    "File Format": "fileFormat",
-    "Camera Type": "deviceName",
-    "Record Rate(fps)": "recordRate",
-    "Save Step": "skipFrame",
+    "Total Frame": "frameInfo/totalFrame",
+    "Image Width": "imageDataInfo/resolution/width",
+    "Image Height": "imageDataInfo/resolution/height",
+    "Color Type": "imageDataInfo/colorInfo/type",
+    "Color Bit": "imageDataInfo/colorInfo/bit",
+    "File Format": "imageFileInfo/fileFormat",
+    "Camera Type": "deviceInfo/deviceName",
+    "Record Rate(fps)": "recordInfo/recordRate",
+    "Save Step": "frameInfo/skipFrame",
 }
-"""Elements of the XML header by the keys of the text header."""
+"""Elements of the XML header, each in its parents, by the keys of the text header: names such as width come twice."""
 _MODEL = re.compile(r"-([MC])\d*(?![A-Za-z0-9])")
 """Letter in the name of a model that says monochrome or colour, as in "type 1100K-M-64GB" and "model 675K-M3"."""
 
@@ -101,14 +103,13 @@ def _beside(file: Path, suffix: str) -> Path | None:
 
 def _text_entries(text: str) -> dict[str, str]:
     """Return the entries of a text header, "key : value" in each line."""
-    lines = (line.split(" : ", 1) for line in text.splitlines())
-    return {entry[0].strip(): entry[1].strip() for entry in lines if len(entry) == 2}
+    lines = (line.partition(":") for line in text.removeprefix("\ufeff").splitlines())
+    return {key.strip(): value.strip() for key, colon, value in lines if colon}
 
 
 def _xml_entries(text: str) -> dict[str, str]:
     """Return the entries of an XML header, which stands between other bytes, under the keys of the text header."""
-    found = {key: _element(text, name) for key, name in _XML_KEYS.items()}
-    found["Color Type"] = _element(_element(text, "colorInfo"), "type")
+    found = {key: functools.reduce(_element, path.split("/"), text) for key, path in _XML_KEYS.items()}
     return {key: value for key, value in found.items() if value}
 
 

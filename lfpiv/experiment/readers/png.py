@@ -32,7 +32,7 @@ class Png(Stack):
         import imagecodecs
 
         pixels: np.ndarray = imagecodecs.png_decode(self._file.read_bytes())
-        return pixels
+        return pixels[..., 0] if pixels.ndim == 3 else pixels  # a grey value may be named as transparent
 
 
 def _header(image: ImagePath) -> Header:

@@ -85,6 +85,8 @@ class Stack(ABC):
     def number(self, part: str) -> int:
         """Return the number of the image that the text behind ``#`` names; raise NotOneImage if there is none."""
         if not part:
+            if self.count == 0:
+                raise NoSuchImage(f"a file of no {self.noun}s: nothing was recorded")
             if self.count != 1:
                 raise NotOneImage(f"{self._counted()}; name one behind the file: #0 to #{self.count - 1}")
             return 0

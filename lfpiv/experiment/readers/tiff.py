@@ -5,6 +5,7 @@ ImageJ writes a stack of more than 4 GiB with one directory, that of the first i
 
 from __future__ import annotations
 
+import logging
 import re
 import struct
 import threading
@@ -31,6 +32,8 @@ COMPRESSIONS = {
 """Compressions without loss, whose decoders stop at the size that the directory declares."""
 STRIP_FILL = 4
 """Largest number of bytes that fill up a strip of pixels [byte]."""
+
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it says of damage would come beside our message
 
 
 class TiffStack(Stack):
@@ -126,6 +129,8 @@ class TiffStack(Stack):
 
     def _checked(self, page: tifffile.TiffPage, number: int) -> Header:
         """Return the header of a page; refuse one that is not one single-channel image with all its pixels."""
+        if not page.shape:
+            raise ValueError("a page that states no size")
         if len(page.shape) != 2 or page.samplesperpixel != 1:
             raise NotOneImage(
                 f"pixels of shape {page.shape} in one page, such as a colour image, or a stack that was saved as one "
@@ -134,6 +139,13 @@ class TiffStack(Stack):
         meaning = tifffile.PHOTOMETRIC(page.photometric)
         if meaning is not tifffile.PHOTOMETRIC.MINISBLACK:
             raise NotOneImage(f"{meaning.name} pixels; save raw grey values, 0 = black")
+        if (turned := page.tags.valueof("Orientation", 1)) not in (0, 1):  # 0 is no value of the tag
+            raise NotOneImage(
+                f"pixels to be shown turned or mirrored (tag Orientation is {turned}), which programs do or do not; "
+                "save them as they are shown, with the tag 1"
+            )
+        if page.bitspersample == 24:  # tifffile reads them wrong where the highest byte comes first
+            raise NotOneImage("pixels of 24 bits; save 8, 16 or 32 bits")
         if page.compression not in COMPRESSIONS.values():
             known = ", ".join(list(COMPRESSIONS)[1:])
             raise NotOneImage(
