@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -162,6 +163,8 @@ def writing(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
+        if error.errno == errno.EFBIG:
+            reason += " for this file system, or for the limit of this session (ulimit -f)"
         if isinstance(error, FileNotFoundError) and not path.parent.exists():
             raise StorageError(
                 f"{path}: cannot be written: its folder was removed or renamed meanwhile, with what it held. Put it "

@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lfpiv.errors import InputError
+from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.recording import Recording
 from lfpiv.files import remove_leftovers, writing
 from lfpiv.records import RecordError, read_object, validate
@@ -164,6 +164,14 @@ class Folder:
             shutil.rmtree(self.shared, ignore_errors=True)
         else:
             self.shared.unlink(missing_ok=True)  # `rmtree` would wait for a pipe
+
+    def require_kept(self) -> None:
+        """Raise StorageError if the folder was removed or renamed after the calibration: later results make it anew."""
+        if not self.calibration.exists():
+            raise StorageError(
+                f"{self.path}: it was removed or renamed during the run, with what it held. Put it back, or run the "
+                "command again."
+            )
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:

@@ -6,9 +6,11 @@ the work if they differ, and names the differences.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -147,9 +149,26 @@ def require_marks(path: Path) -> Marks:
         raise DamagedFile(path, f"its attributes have another form: {error}") from None
 
 
+_rejected: ContextVar[set[tuple[Path, str]] | None] = ContextVar("_rejected", default=None)
+
+
+@contextlib.contextmanager
+def rejected_once() -> Iterator[None]:
+    """Log within this block only once that a file is not used: a run reads some of them twice."""
+    token = _rejected.set(set())
+    try:
+        yield
+    finally:
+        _rejected.reset(token)
+
+
 def reject(path: Path, reason: str) -> None:
     """Log that a file is not used, with the reason."""
-    log.warning("%s: damaged or foreign, not used: %s", path, reason)
+    told = _rejected.get()
+    if told is None or (path, reason) not in told:
+        log.warning("%s: damaged or foreign, not used: %s", path, reason)
+    if told is not None:
+        told.add((path, reason))
 
 
 def _text(value: Any, name: str) -> str:

@@ -336,6 +336,7 @@ def _collect(current: Run, outcomes: Generator[Outcome, None, None]) -> Tried:
     tried = Tried(current.numbers)
     with contextlib.closing(outcomes):  # ends the workers if the run is interrupted
         for outcome in outcomes:
+            current.folder.require_kept()
             current.record(outcome, tried)
     current.progress(current.experiment.recording.work, 1.0)
     return tried

@@ -72,6 +72,7 @@ def open_run(
     try:
         with contextlib.ExitStack() as stack:
             warnings = stack.enter_context(collected())
+            stack.enter_context(provenance.rejected_once())
             for warning in recorded_times.contradictions(experiment):
                 warn(log, warning)
             if writes_results:
@@ -286,6 +287,7 @@ class Run:
 
     def finish(self, calibrated: Calibrated, done: Invocation, *, report: bool) -> dict[str, Any]:
         """Write summary.json about all results in the folder, and optionally report.html; return the summary."""
+        self.folder.require_kept()
         contents = self._contents()
         reused = (*(("calibration",) if calibrated.reused else ()), *done.reused)
         done = replace(

@@ -20,7 +20,9 @@ log = logging.getLogger(__name__)
 
 
 def check_images(run: Run, pending: PendingPairs) -> Tried | None:
-    """Check the images of the next pairs and log those that cannot be used; None if the pairs can be tried.
+    """Check the images of the next pairs and log those that cannot be used, unless `pending` is quiet.
+
+    Return None if the pairs can be tried.
 
     If some pairs can be done, all are tried, and the others fail when their turn comes. If none of the pairs to do
     can be done, return their outcomes.
@@ -44,6 +46,8 @@ def check_images(run: Run, pending: PendingPairs) -> Tried | None:
         for pair, reason in bad.items():
             run.record(Outcome(pair=pair, reason=reason), tried)
         return tried
+    if pending.quiet:  # said before
+        return None
     for reason in list(dict.fromkeys(bad.values()))[:NAMED_PAIRS]:
         log.error("%s The other %ss will be done.", reason, run.experiment.noun)
     if len(bad) > NAMED_PAIRS:

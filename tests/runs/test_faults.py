@@ -267,6 +267,7 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
     failed = {item["pair"]: item["reason"] for item in json.loads((out / "summary.json").read_text())["failed"]}
     words = ["no such file", "no such file", "(40, 30)", "NaN"]
     assert list(failed) == list(range(PAIRS)) and f"{PAIRS} of {PAIRS} pairs failed" in written
+    assert said.count("The other pairs will be done") == PAIRS - 1, "each is told once"
     for pair, word in enumerate(words):
         assert word in failed[pair] and images[pair].name in failed[pair]
         assert pair == 0 or word in said.split("image pairs")[0], "the user is not told before the work"

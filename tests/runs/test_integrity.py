@@ -8,7 +8,7 @@ from support.small_run import PAIRS, same_vectors
 from support.stored import rewrite
 
 import lfpiv
-from lfpiv.errors import DamagedFile, InputError
+from lfpiv.errors import DamagedFile, InputError, StorageError
 from lfpiv.results.provenance import read_marks
 from lfpiv.runs import pipeline
 
@@ -47,8 +47,9 @@ def out(small_run, tmp_path):
 
 
 def rejected(caplog):
-    """Return the names of the files that the log names as damaged or foreign, each once."""
+    """Return the names of the files that the log names as damaged or foreign; it names each once in a run."""
     lines = [message for message in caplog.messages if "damaged or foreign, not used" in message]
+    assert len(lines) == len(set(lines))
     return sorted({line.split(": damaged")[0].rsplit("/", 1)[1] for line in lines})
 
 
@@ -84,6 +85,18 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, ca
     with pytest.raises(lfpiv.InputError, match="expected the two volumes"):
         pipeline.correlate(small_run.experiment, out)
     assert rejected(caplog) == [f"pair_000{name}.nc" for name in ("0_a", "1_a", "2_b", "3_a")]
+
+
+@pytest.mark.parametrize("step", ["weights", "image pairs"])
+def test_a_folder_that_is_removed_during_the_run_ends_it(small_run, tmp_path, step):
+    out = small_run.prepared(tmp_path / "out")
+
+    def remove(now, fraction):
+        if now == step and fraction > 0:
+            shutil.rmtree(out, ignore_errors=True)
+
+    with pytest.raises(StorageError, match=r"out.*removed or renamed .*run the command again"):
+        pipeline.run(small_run.experiment, out, pairs=(0, 2), progress=remove)
 
 
 def swap_cameras(path):
