@@ -109,6 +109,17 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def scratch_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder beside `path`, and remove it at the end. `remove_leftovers` finds that of a killed process."""
+    scratch = scratch_path(path)
+    scratch.mkdir()
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
 def write_bytes(content: bytes | memoryview, path: Path) -> None:
     """Write a file atomically. HDF5 files too: HDF5 itself crashes the process if the disk becomes full."""
     with replacing(path) as scratch:

@@ -34,6 +34,20 @@ def test_a_folder_that_was_removed_meanwhile_is_named_and_nothing_said_to_be_com
         raise OSError(28, "No space left on device")
 
 
+def test_the_folder_of_a_killed_export_is_removed_by_the_next_one(tmp_path):
+    code = (
+        "import os, sys; from pathlib import Path; from lfpiv.files import scratch_folder\n"
+        "with scratch_folder(Path(sys.argv[1])) as folder:\n    (folder / 'image.vti').touch(); os._exit(9)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, str(tmp_path / "pair_0000.vti")], check=False)
+    (left,) = tmp_path.iterdir()
+    assert ended.returncode == 9 and left.is_dir()
+    with files.scratch_folder(tmp_path / "pair_0001.vti"):
+        files.remove_leftovers(tmp_path)
+        assert len(list(tmp_path.iterdir())) == 1
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("write", "content"), [("write_bytes", b"new"), ("write_text", "new"), ("write_json", "new")])
 def test_a_written_file_appears_at_once_and_whole(tmp_path, monkeypatch, write, content):
     """A process that ends before the new file takes its place leaves the old file."""

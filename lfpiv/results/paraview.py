@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import xarray as xr
 from pyevtk.hl import imageToVTK
 from pyevtk.vtk import VtkGroup
 
-from lfpiv.files import replacing, state_origin
+from lfpiv.files import replacing, scratch_folder, state_origin
 
 
 def write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path: Path) -> None:
@@ -32,9 +31,9 @@ def write_image(arrays: dict[str, Any], places: xr.Dataset | xr.DataArray, path:
     points = {
         name: tuple(map(ordered, item)) if isinstance(item, tuple) else ordered(item) for name, item in arrays.items()
     }
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
+    with scratch_folder(path) as scratch:
         origin = tuple(float(axis[0]) for axis in axes)
-        written = imageToVTK(str(Path(scratch) / "image"), origin=origin, spacing=spacing, pointData=points)
+        written = imageToVTK(str(scratch / "image"), origin=origin, spacing=spacing, pointData=points)
         state_origin(Path(written))
         os.replace(written, path)
 
@@ -96,10 +95,10 @@ def _add_array(parent: ElementTree.Element, name: str, values: np.ndarray) -> No
 
 def write_collection(files: dict[Path, float], path: Path) -> None:
     """Write a ParaView collection of files, with relative paths, and their times."""
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as scratch:
-        group = VtkGroup(str(Path(scratch) / "collection"))
+    with scratch_folder(path) as scratch:
+        group = VtkGroup(str(scratch / "collection"))
         for file, time in files.items():
-            group.addFile(str(Path(scratch) / file.name), sim_time=time)
+            group.addFile(str(scratch / file.name), sim_time=time)
         group.save()
-        state_origin(Path(scratch) / "collection.pvd")
-        os.replace(Path(scratch) / "collection.pvd", path)
+        state_origin(scratch / "collection.pvd")
+        os.replace(scratch / "collection.pvd", path)
