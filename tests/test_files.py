@@ -1,5 +1,6 @@
 """Files of a run: whole-or-nothing writing, and the hash of settings."""
 
+import errno
 import json
 import subprocess
 import sys
@@ -32,6 +33,11 @@ def test_a_folder_that_was_removed_meanwhile_is_named_and_nothing_said_to_be_com
     assert "complete" not in str(caught.value)
     with pytest.raises(StorageError, match="Finished results are complete"), files.writing(path):
         raise OSError(28, "No space left on device")
+    with (
+        pytest.raises(StorageError, match=r"file too large .*limit of this session \(ulimit -f\)"),
+        files.writing(path),
+    ):
+        raise OSError(errno.EFBIG, "File too large")
 
 
 def test_the_folder_of_a_killed_export_is_removed_by_the_next_one(tmp_path):

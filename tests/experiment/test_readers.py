@@ -452,6 +452,10 @@ def test_a_png_has_one_image(tmp_path, frames):
     (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(frames[0]))
     np.testing.assert_array_equal(read(tmp_path / "a.png", "#0"), frames[0])
     refuse(tmp_path / "a.png", "#1", "1 image, none of them #1")
+    (tmp_path / "filled.png").write_bytes((tmp_path / "a.png").read_bytes() + bytes(100))
+    np.testing.assert_array_equal(read(tmp_path / "filled.png"), frames[0])
+    (tmp_path / "cut.png").write_bytes((tmp_path / "a.png").read_bytes()[:-12])
+    refuse(tmp_path / "cut.png", "", "ends before its end marker")
 
 
 def test_a_grey_value_of_a_png_may_be_named_as_transparent(tmp_path, frames):

@@ -8,6 +8,9 @@ from lfpiv.experiment.readers.limits import require_plausible
 from lfpiv.experiment.readers.source import Header, ImagePath, NotOneImage
 from lfpiv.experiment.readers.stack import Stack
 
+MOST_BEHIND = 4096
+"""Largest number of bytes from the end marker on, such as of files that are filled to whole blocks [byte]."""
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -39,11 +42,11 @@ def _header(image: ImagePath) -> Header:
     size = image.file.stat().st_size
     with image.file.open("rb") as file:
         start = file.read(26)
-        file.seek(max(size - 12, 0))
-        end = file.read(12)
+        file.seek(max(size - MOST_BEHIND, 0))
+        end = file.read()
     if start[:8] != _SIGNATURE or len(start) < 26:
         raise ValueError("no PNG signature")
-    if end[4:8] != b"IEND":
+    if b"IEND" not in end:
         raise ValueError("the file ends before its end marker")
     columns, rows = (int.from_bytes(start[at : at + 4], "big") for at in (16, 20))
     depth, colour = start[24], start[25]
