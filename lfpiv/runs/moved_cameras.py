@@ -204,8 +204,8 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
 class ShownParticles:
     """Images of the pairs that show particles, without the light that stays in place in all of them.
 
-    One pair does not tell that light in a slow flow, where particles hardly move between its frames. All images of a
-    camera are scaled to equal light: one in the place of another is judged by its particles, not by its exposure.
+    One pair does not tell that light in a slow flow, where particles hardly move between its frames. The images of a
+    frame are scaled to equal light: a camera is judged by its particles, not by its exposure.
     """
 
     experiment: Experiment
@@ -223,7 +223,7 @@ class ShownParticles:
 
     @cached_property
     def _levels(self) -> dict[Frame, Mapping[str, float]]:
-        """Mean counts of the images that were read, by which they are divided."""
+        """Light of the cameras in the frames that were read, over its geometric mean; images are divided by it."""
         return {}
 
     @cached_property
@@ -272,10 +272,10 @@ class ShownParticles:
             light, _ = without_background(camera, raw, self._darks[name], frame)
             if seen_structure(light, camera.decoder) < NOISE:
                 raise ValueError("expected particles, found only noise")
-            mean = float(np.mean(light, dtype=float))
-            levels[name] = mean if mean > 0 else 1.0
-            found[name] = light * np.float32(1 / levels[name])
-        self._levels[frame] = levels
+            found[name], levels[name] = light, float(np.mean(light, dtype=float))
+        usual = float(np.exp(np.mean(np.log(list(levels.values()))))) if min(levels.values()) > 0 else 0.0
+        self._levels[frame] = {name: level / usual if usual else 1.0 for name, level in levels.items()}
+        found = {name: light / np.float32(self._levels[frame][name]) for name, light in found.items()}
         kept = max(len(self.experiment.frames), KEPT_BYTES // sum(image.nbytes for image in found.values()))
         for old in list(self._recent)[: max(len(self._recent) + 1 - kept, 0)]:
             del self._recent[old]

@@ -37,12 +37,12 @@ def without_unmeasured(vectors: xr.Dataset, volumes: PairVolumes) -> xr.Dataset:
     """Mark all vectors as not valid if images do not belong where they are, or too few cameras saw particles."""
     cameras = len(volumes.records[0].structure)
     warnings = [record.warnings for record in volumes.records]
-    if any(warning.code in (Code.MISMATCHED, Code.NOTHING_IN_COMMON) for warning in volumes.between):
+    if image_checks.unmeasured(warnings, cameras):
+        verdict = NO_PARTICLES
+    elif any(warning.code in (Code.MISMATCHED, Code.NOTHING_IN_COMMON) for warning in volumes.between):
         verdict = UNLIKE_PARTICLES
     elif image_checks.misplaced(warnings):
         verdict = MISPLACED
-    elif image_checks.unmeasured(warnings, cameras):
-        verdict = NO_PARTICLES
     else:
         return vectors
     return refused(vectors, verdict)

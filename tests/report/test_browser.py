@@ -132,6 +132,7 @@ class Tab:
 
 @pytest.fixture
 def tab(browser, reported):
+    browser.get("about:blank")  # a page of the studio goes on to say that its server has ended
     tab = Tab(browser, reported.page)
     tab.errors()
     yield tab

@@ -11,7 +11,7 @@ from lfpiv.experiment.readers.stack import Stack
 MOST_BEHIND = 4096
 """Largest number of bytes from the end marker on, such as of files that are filled to whole blocks [byte]."""
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_SIGNATURE, _END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
 class Png(Stack):
@@ -46,7 +46,7 @@ def _header(image: ImagePath) -> Header:
         end = file.read()
     if start[:8] != _SIGNATURE or len(start) < 26:
         raise ValueError("no PNG signature")
-    if b"IEND" not in end:
+    if _END not in end:
         raise ValueError("the file ends before its end marker")
     columns, rows = (int.from_bytes(start[at : at + 4], "big") for at in (16, 20))
     depth, colour = start[24], start[25]
