@@ -111,7 +111,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def scratch_folder(path: Path) -> Iterator[Path]:
-    """Yield a new folder beside `path`, and remove it at the end. `remove_leftovers` finds that of a killed process."""
+    """Yield a new folder beside `path`, and remove it at the end; `remove_leftovers` does so for killed processes."""
     scratch = scratch_path(path)
     scratch.mkdir()
     try:

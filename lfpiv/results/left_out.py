@@ -64,7 +64,7 @@ def of_export(
     if to == "tecplot" and (
         gaps := tuple(f"NaN of {name}" for name, one in results.data_vars.items() if one.isnull().any())
     ):
-        yield LeftOut(gaps, "Tecplot's text has none: 0 stands there")
+        yield LeftOut(gaps, "Tecplot's text has no NaN, so 0 is written")
     if to == "vtp":
         yield LeftOut(tuple(map(str, results.data_vars)), "this format is of particles: vti has the vectors")
     if with_particles and to not in ("csv", "vtp"):

@@ -7,6 +7,7 @@ far apart the cameras show the same particles; `correct` fits the movements of t
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -18,9 +19,9 @@ from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import read_darks, without_background
-from lfpiv.runs.moved_frames import AGREEING, FRAMES, LIKE, moved_frames
+from lfpiv.runs.moved_frames import FRAMES, moved_frames
 from lfpiv.selfcalibration.disparity import CameraVolumes, still_light, unlinked, without_still_light
-from lfpiv.selfcalibration.movements import Verdict, fit_movements, self_calibrate
+from lfpiv.selfcalibration.movements import AGREEING, Verdict, fit_movements, self_calibrate
 from lfpiv.warn import Code, Warning, warn
 
 if TYPE_CHECKING:
@@ -196,16 +197,16 @@ def _agree(volumes: CameraVolumes, used: Sequence[int], fit: MovementFit) -> boo
     if len(used) < AGREEING:
         return False
     alone = [part.disparities() for part in volumes.each(FRAMES)]
-    fits = [fit_movements(found, list(fit.cameras), volumes.weights.grid) for found in alone if found]
-    return sum(fit.share_in(one) > LIKE for one in fits) >= AGREEING
+    return fit.agrees_with(fit_movements(found, list(fit.cameras), volumes.weights.grid) for found in alone if found)
 
 
 @dataclass(frozen=True)
 class ShownParticles:
     """Images of the pairs that show particles, without the light that stays in place in all of them.
 
-    One pair does not tell that light in a slow flow, where particles hardly move between its frames. The images of a
-    frame are scaled to equal light: a camera is judged by its particles, not by its exposure.
+    One pair does not tell that light in a slow flow, where particles hardly move between its frames. A camera on
+    another scale than in most frames of the pairs, while other cameras are not, is brought to its usual scale: it is
+    judged by its particles.
     """
 
     experiment: Experiment
@@ -223,12 +224,22 @@ class ShownParticles:
 
     @cached_property
     def _levels(self) -> dict[Frame, Mapping[str, float]]:
-        """Light of the cameras in the frames that were read, over its geometric mean; images are divided by it."""
+        """Mean count of each camera's image in the frames that were read and show particles."""
         return {}
 
     @cached_property
+    def _frames(self) -> list[Frame]:
+        """Frames of the pairs whose images can be used."""
+        return [frame for pair in self.pairs for frame in self._readable(pair)]
+
+    @cached_property
+    def _usual(self) -> dict[str, float]:
+        """Median over the frames of each camera's mean count."""
+        return {name: float(np.median([self._levels[frame][name] for frame in self._frames])) for name in self.cameras}
+
+    @cached_property
     def _still(self) -> dict[str, np.ndarray]:
-        return still_light(images for pair in self.pairs for images in self._readable(pair))
+        return still_light(self._scaled(frame) for frame in self._frames)
 
     def __call__(self, pair: int, frame: int) -> Mapping[str, np.ndarray] | None:
         """Return the images of a frame, 0 or 1, of a pair, camera -> image; None if it has none that show particles."""
@@ -248,34 +259,51 @@ class ShownParticles:
         """Return the mean count of each camera's first image of a pair as it is stored; raise ValueError as `pair`."""
         first = self.experiment.pair_frames(pair)[0]
         moving = self._moving(first)
-        return {name: level * float(np.mean(moving[name], dtype=float)) for name, level in self._levels[first].items()}
+        return {name: scale * float(np.mean(moving[name], dtype=float)) for name, scale in self._scale(first).items()}
 
     def _moving(self, frame: Frame) -> Mapping[str, np.ndarray]:
-        still = self._still
-        return without_still_light(self._light(frame), still) if still else self._light(frame)
+        still, images = self._still, self._scaled(frame)
+        return without_still_light(images, still) if still else images
 
-    def _readable(self, pair: int) -> list[Mapping[str, np.ndarray]]:
-        """Return the images of both frames with the light that stays in place; none if those of one cannot be used."""
+    def _readable(self, pair: int) -> Sequence[Frame]:
+        """Return both frames of a pair; none if the images of one cannot be used."""
+        frames = self.experiment.pair_frames(pair)
         try:
-            return [self._light(frame) for frame in self.experiment.pair_frames(pair)]
+            for frame in frames:
+                self._light(frame)
         except ValueError as error:  # a pair that cannot be used fails when it is reconstructed
             log.debug("movements of the cameras without pair %d: %s", pair, error)
-            return []
+            return ()
+        return frames
+
+    def _scaled(self, frame: Frame) -> Mapping[str, np.ndarray]:
+        """Return the images of a frame, each on the usual scale of its camera; raise ValueError as `_light`."""
+        light = self._light(frame)
+        return {name: light[name] / np.float32(scale) for name, scale in self._scale(frame).items()}
+
+    def _scale(self, frame: Frame) -> dict[str, float]:
+        """Return the scale of each image of a frame that was read: 1 for the camera nearest to its usual scale.
+
+        What all cameras share is the exposure of the frame, which stays.
+        """
+        levels = self._levels[frame]
+        if not self._frames or min(*levels.values(), *self._usual.values()) <= 0:
+            return dict.fromkeys(levels, 1.0)
+        ratios = {name: level / self._usual[name] for name, level in levels.items()}
+        exposure = min(ratios.values(), key=lambda ratio: abs(math.log(ratio)))
+        return {name: ratio / exposure for name, ratio in ratios.items()}
 
     def _light(self, frame: Frame) -> Mapping[str, np.ndarray]:
         """Return the images of a frame; raise ValueError if one is missing or damaged, or shows only noise."""
         if frame in self._recent:
             return self._recent[frame]
-        found, levels = {}, {}
+        found = {}
         for name, camera in self.cameras.items():
             raw = self.experiment.frame_image(name, frame)
-            light, _ = without_background(camera, raw, self._darks[name], frame)
-            if seen_structure(light, camera.decoder) < NOISE:
+            found[name], _ = without_background(camera, raw, self._darks[name], frame)
+            if frame not in self._levels and seen_structure(found[name], camera.decoder) < NOISE:
                 raise ValueError("expected particles, found only noise")
-            found[name], levels[name] = light, float(np.mean(light, dtype=float))
-        usual = float(np.exp(np.mean(np.log(list(levels.values()))))) if min(levels.values()) > 0 else 0.0
-        self._levels[frame] = {name: level / usual if usual else 1.0 for name, level in levels.items()}
-        found = {name: light / np.float32(self._levels[frame][name]) for name, light in found.items()}
+        self._levels[frame] = {name: float(np.mean(image, dtype=float)) for name, image in found.items()}
         kept = max(len(self.experiment.frames), KEPT_BYTES // sum(image.nbytes for image in found.values()))
         for old in list(self._recent)[: max(len(self._recent) + 1 - kept, 0)]:
             del self._recent[old]

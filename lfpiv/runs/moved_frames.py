@@ -23,10 +23,6 @@ MOVED_VOXEL = 0.5
 """Least distance between both frames that is told [voxel]. Sound rigs show less than 0.1 by three pairs."""
 FRAMES = 2
 """Instants of a pair."""
-LIKE = 0.5
-"""Least share of the movements shown by all pairs together in those that a pair shows alone, of pairs that agree."""
-AGREEING = 2
-"""Least number of pairs that agree on cameras that moved, where more than one was used: chance peaks differ by pair."""
 
 
 def moved_frames(volumes: CameraVolumes, cameras: Mapping[str, CalibratedCamera], *, in_order: bool) -> Warning | None:
@@ -40,8 +36,8 @@ def moved_frames(volumes: CameraVolumes, cameras: Mapping[str, CalibratedCamera]
     if moved is None or moved.separation.mm < MOVED_VOXEL * voxel_mm:
         return None
     if not moved.separation.significant:
-        alone = [_between(part, cameras) for part in volumes.each(FRAMES)]
-        if sum(one is not None and moved.share_in(one) > LIKE for one in alone) < AGREEING:
+        alone = (_between(part, cameras) for part in volumes.each(FRAMES))
+        if not moved.agrees_with(one for one in alone if one is not None):
             return None
     shifts = {name: movement.shift_mm for name, movement in moved.movements.items()}
     others = len(shifts) / (len(shifts) - 1)  # shifts have the mean zero

@@ -13,7 +13,7 @@ from lfpiv.runs.reversed_pairs import MOST
 from lfpiv.warn import Code, Warning, gather
 
 OTHER_SCALE = 8.0
-"""Ratio of a camera's counts to those of the other cameras, over the run's usual ratio, that is told."""
+"""Least ratio of a camera's counts to the other cameras' counts, over its usual value in the run, that is told."""
 
 
 def other_scales(figures: Mapping[int, PairFigures]) -> list[Warning]:

@@ -315,7 +315,7 @@ class Run:
             self._keep(self.files(pair))
 
     def _unlike_pairs(self, contents: Contents) -> list[Warning]:
-        """Log and return the warnings about pairs whose flow runs against that of the others, or on another scale."""
+        """Log and return the warnings about pairs unlike the others: by their flow, or by a camera's scale."""
         found = [*reversed_pairs(contents.vectors), *other_scales(contents.vectors)]
         for warning in found:
             log.warning("%s", warning.sentence)

@@ -13,7 +13,7 @@ light-field images do not.
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +49,10 @@ LEFT_OUT = 8
 """Largest number of groups of disparities that are left out in turn."""
 OUTLIER = 2.0
 """Residual at which a disparity's weight is a quarter, as a multiple of 1.5 times the median residual."""
+LIKE = 0.5
+"""Least share of the movements shown by all images together in the movements that a part of them shows alone."""
+AGREEING = 2
+"""Least number of parts that agree on cameras that moved: chance peaks differ from part to part."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +178,7 @@ class MovementFit:
         return replace(self, values=projection @ self.values)
 
     def since(self, other: MovementFit) -> MovementFit:
-        """Return the movements from those of another fit, of other images, to these."""
+        """Return these movements less the movements of another fit, to other images."""
         return replace(
             self,
             values=self.values - other.values,
@@ -185,9 +189,13 @@ class MovementFit:
         )
 
     def share_in(self, other: MovementFit) -> float:
-        """Return how much of these movements is in those of another fit: 1 if they are equal, -1 if opposite."""
+        """Return how much of these movements another fit shows: 1 if they are equal, -1 if opposite."""
         along = self.observed @ self.values
         return float(along @ other.values / (along @ self.values))
+
+    def agrees_with(self, parts: Iterable[MovementFit]) -> bool:
+        """Return whether several fits, each to a part of the images alone, show about these movements."""
+        return sum(self.share_in(one) > LIKE for one in parts) >= AGREEING
 
     @property
     def explained_mm(self) -> float:

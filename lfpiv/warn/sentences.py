@@ -255,7 +255,7 @@ SENTENCES: Mapping[Code, str] = {
     Code.APART: "{names} show the same particles {voxel:.1f} voxel ({mm:.3f} mm) apart: {cause}; {advice}.",
     Code.MOVED_FRAMES: (
         "beside the other cameras, the second frames show the particles {voxel:.1f} voxel from where the first frames "
-        "show them, {lenses:.1f} microlens in the image: the camera moved between its exposures, or {cause}. Vectors "
+        "show them, {lenses:.1f} microlenses in the image: the camera moved between its exposures, or {cause}. Vectors "
         "are wrong by about as much; compare both frames of the camera where nothing moves"
     ),
     Code.NOTHING_IN_COMMON: (
@@ -305,8 +305,8 @@ SENTENCES: Mapping[Code, str] = {
         "the order of its images"
     ),
     Code.OTHER_SCALE: (
-        "the counts beside those of {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, "
-        "exposure, or the scale of the files changed. Each camera's scale is divided out in every pair, up to 25 times"
+        "the counts relative to {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, exposure, "
+        "or the scale of the files changed. Each camera's scale is divided out in every pair, up to 25 times"
     ),
     Code.FEW_VECTORS: (
         "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "

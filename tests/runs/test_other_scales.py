@@ -27,7 +27,7 @@ def test_of_two_cameras_the_first_is_told_beside_the_other():
     usual = {"left": 1.0, "right": 0.7}
     pairs = dict.fromkeys(range(4), figures(**usual)) | {0: figures(left=1.0, right=16 * 0.7)}
     (found,) = other_scales(pairs)
-    assert found.subject == "left" and "beside those of right are about 16 times as low" in found.sentence
+    assert found.subject == "left" and "relative to right are about 16 times as low" in found.sentence
 
 
 def test_nothing_is_told_of_usual_changes_few_pairs_or_a_pair_without_particles():

@@ -171,11 +171,13 @@ def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_pa
     assert 12 < float(said.split(" have ")[1].split()[0]) < 20  # the cameras are not equally bright
 
 
-def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tmp_path):
+@pytest.mark.slow(but="16")
+@pytest.mark.parametrize("ratio", [16, 1 / 16])
+def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tmp_path, ratio):
     """Images of other pairs, on the usual scale, are the measure of chance and of the light that stands still."""
     file = small_run.images(tmp_path / "data")
     for path in sorted((file.parent / "particles" / "left").iterdir())[:2]:
-        tifffile.imwrite(path, tifffile.imread(path) * np.float32(16))
+        tifffile.imwrite(path, tifffile.imread(path) * np.float32(ratio))
     experiment, weights = lfpiv.open_experiment(file), rig[1]
     shown = ShownParticles(experiment, weights.cameras, [0, 1, 2])
     assert not belonging.refusals_of(shown, ImageFit(weights), 0)

@@ -26,8 +26,8 @@ _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
 _CLEAR = 1.5  # root mean square over the zones of displacements in standard errors that is told; 1 by chance
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
-
-_ROUNDING = 1e-6  # least variance of a common displacement, as a share of the largest
+_ROUNDING = 1e-6  # least variance of an error, as a share of the largest
+_LEAST_SHARE = 1e-10  # least variance of displacements that is tried, as a share of the prior's: a millionth of a pitch
 
 
 def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> np.ndarray:
@@ -91,13 +91,13 @@ def shared_error(fits: Sequence[DotFit], left_over_mm: np.ndarray, pitch_mm: flo
     variance, axes = np.linalg.eigh(scatter[inner][:, inner])
     variance, square = np.maximum(variance, _ROUNDING * variance[-1]), (axes.T @ mean[inner]) ** 2
 
-    def unlikely(log_of: float) -> float:
-        total = np.exp(log_of) + variance
+    def deviance(log_variance: float) -> float:
+        total = math.exp(log_variance) + variance
         return float((np.log(total) + square / total).sum())
 
-    lowest = np.log(variance[0])
-    found = minimize_scalar(unlikely, bounds=(lowest, 2 * np.log(_PRIOR_PITCHES * pitch_mm)), method="bounded")
-    return math.sqrt(math.pi / 2 * math.exp(found.x)) if found.x > lowest + 1 else 0.0
+    largest = 2 * math.log(_PRIOR_PITCHES * pitch_mm)
+    found = minimize_scalar(deviance, bounds=(largest + math.log(_LEAST_SHARE), largest), method="bounded")
+    return math.sqrt(math.pi / 2 * math.exp(found.x))
 
 
 def _equations(fits: Sequence[DotFit]) -> tuple[np.ndarray, np.ndarray]:
