@@ -122,15 +122,16 @@ def test_images_of_a_cine_are_numbered_from_the_first_one_stored(tmp_path, frame
         require_numbered(tmp_path / "run.cine", cut)
 
 
-def test_a_cine_needs_no_setup_and_no_times(tmp_path, frames):
+@pytest.mark.parametrize("first", [0, 2], ids=["in order", "from the middle on, as a ring of memory holds them"])
+def test_a_cine_needs_no_setup_no_times_and_no_order(tmp_path, frames, first):
     count, rows, columns = frames.shape
     images_at = 44 + 40 + 8 * count
     size = 8 + 2 * rows * columns
     data = struct.pack("<2sHHHiIiI", b"CI", 44, 2, 1, 0, count, 0, count)
     data += struct.pack("<IIIQ", 44, 84, 84, 0)
     data += struct.pack("<IiiHHIIiiII", 40, columns, rows, 1, 16, 0, size - 8, 0, 0, 0, 0)
-    data += struct.pack(f"<{count}q", *(images_at + number * size for number in range(count)))
-    for frame in frames:
+    data += struct.pack(f"<{count}q", *(images_at + (number + first) % count * size for number in range(count)))
+    for frame in np.roll(frames, first, axis=0):
         data += struct.pack("<II", 8, size - 8) + frame[::-1].tobytes()
     (tmp_path / "run.cine").write_bytes(data)
     require_numbered(tmp_path / "run.cine", frames)

@@ -66,14 +66,17 @@ class Cine(Frames):
         self._turns = _turns(self._field(ROTATE_AT, "<i"))
         self._offsets_at = offsets_at
         self._offset = struct.Struct("<q" if version else "<I")
+        self._table_end = offsets_at + count * self._offset.size
         self._require_table()
         self._table = _linear_counts() if self._packing == PACKED_10 else None
 
     def place(self, number: int) -> tuple[int, int]:
         """Return first byte and number of bytes of an image's pixels, behind its annotation."""
-        start = self._start(number)
-        if start > self.size or (number and not self._start(0) <= self._start(number - 1) < start):
-            raise ValueError(f"image {number} begins at byte {start}, the file ends at byte {self.size}")
+        start, least = self._start(number), self._table_end
+        if not least <= start <= self.size:
+            raise ValueError(f"image {number} begins at byte {start}, expected one from {least} to {self.size}")
+        if number and abs(start - (other := self._start(number - 1))) < self._lengths()[0]:
+            raise ValueError(f"image {number} begins at byte {start}, within image {number - 1} at byte {other}")
         (annotation,) = struct.unpack("<I", read_bytes(self.file, start, 4))
         if annotation < 8 or start + annotation > self.size:
             raise ValueError(f"image {number} has an annotation of {annotation} bytes")
@@ -140,9 +143,8 @@ class Cine(Frames):
         return int(self._offset.unpack(read_bytes(self.file, entry, self._offset.size))[0])
 
     def _require_table(self) -> None:
-        """Refuse a table of images that does not end before the first of them."""
-        end = self._offsets_at + self.count * self._offset.size
-        if not self.count or end > self.size or not end <= self._start(0) <= self._start(self.count - 1):
+        """Refuse a table that ends behind the file or its first image. Images may be stored in any order."""
+        if not self.count or self._table_end > min(self.size, self._start(0)):
             raise ValueError(f"no table of {self.count} images at byte {self._offsets_at}")
 
     def _lengths(self) -> tuple[int, ...]:
