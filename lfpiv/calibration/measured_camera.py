@@ -226,8 +226,8 @@ def _measure_dots(
 
 @contextlib.contextmanager
 def input_errors(place: str) -> Iterator[None]:
-    """Raise every ValueError as an InputError that names the file and the camera."""
+    """Name the file and the camera in every InputError; any other error is a fault of the program."""
     try:
         yield
-    except ValueError as error:
+    except InputError as error:
         raise InputError(f"{place}: {error}") from None

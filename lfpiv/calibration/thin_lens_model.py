@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from lfpiv.errors import InputError
 from lfpiv.geometry.optics import Optics
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import NORMAL_MAD
@@ -207,7 +208,7 @@ def _check_labels(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, std:
         if not np.isfinite(value).all():
             raise ValueError(f"{name}: expected finite values [mm], got NaN or infinity; leave those labels out.")
     if count < LEAST_LABELS:
-        raise ValueError(f"points: a thin-lens fit needs at least {LEAST_LABELS} labels, got {count}; find more dots.")
+        raise InputError(f"points: a thin-lens fit needs at least {LEAST_LABELS} labels, got {count}; find more dots.")
     if std.shape != (count,) or not (np.isfinite(std) & (std > 0)).all():
         raise ValueError(f"std: expected {count} positive finite values, one per label, got shape {std.shape}.")
 
@@ -266,7 +267,7 @@ def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, opti
     centred = points - middle
     strength = np.linalg.svd(centred, compute_uv=False)
     if strength[2] < LEAST_DEPTH * strength[0]:
-        raise ValueError(
+        raise InputError(
             "points: a thin-lens fit needs dots that span a volume, these lie in one plane or line; "
             "give board images at two or more depths."
         )
@@ -288,7 +289,7 @@ def _linear_start(points: np.ndarray, pupil: np.ndarray, array: np.ndarray, opti
     left, _, right_vectors = np.linalg.svd(axes)
     rotation = left @ right_vectors
     if rotation[2] @ gain_slope < -0.5 * np.linalg.norm(gain_slope):
-        raise ValueError(
+        raise InputError(
             "array: the labels are mirrored: the dots' handedness contradicts the depth at which they are in focus; "
             "check image_flip of this camera and the order of the board's planes."
         )

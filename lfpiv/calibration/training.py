@@ -29,6 +29,7 @@ from lfpiv.calibration.levenberg_marquardt import (
 )
 from lfpiv.calibration.network import Network
 from lfpiv.calibration.virtual_samples import VirtualSampler
+from lfpiv.errors import InputError
 
 FIRST_RIDGE = 1e-6
 """Ridge of the first output layer, relative to the mean diagonal of its normal equations."""
@@ -220,7 +221,7 @@ def split_samples(
     part_of[order] = np.searchsorted(np.cumsum(parts)[:2], middle)
     training, validation, test = (np.flatnonzero(part_of[member] == part) for part in range(3))
     if 0 in (training.size, validation.size, test.size):
-        raise ValueError(
+        raise InputError(
             f"split: {count} samples in {number} groups are too few for shares of {tuple(parts)}: a part would be "
             "empty; give more samples or groups."
         )

@@ -14,11 +14,13 @@ SATURATED = 0.02
 
 _LEAST_SATURATED = 20  # least number of saturated pixels
 _WIDTHS = (0.0, 0.005)  # width of a pile over its level: one value, or values spread by a camera's own corrections
-_LEAST_SPREAD = 200  # least number of pixels of a spread pile
+_LEAST_SPREAD = 200  # least number of pixels of a spread pile, and of one of the last value
+_LEAST_WIDTH = 3.0  # least width of such a pile [counts]: of few bits a single value is as wide
 _BELOW = 0.1  # depth below the bright pixels in which a pile is compared, too: half of a white image may be as bright
 _NEIGHBOURS = 3  # values, or intervals, below a pile that it is compared with
 _PILE = 4.0  # pixels of a pile, relative to each of them
 _ABOVE = 0.25  # pixels above a pile, such as hot ones, relative to the pile: at most
+_LAST, _ABOVE_LAST = 1.2, 0.02  # the same two of the last value: of few bits, noise fills the values below a pile
 _LEAST_AREAS = 5  # least number of separate areas in a pile: fewer may be a bright particle of even light
 _ISOLATED = 0.2  # part of a pile's pixels with a bright neighbour: at least, or they are hot pixels
 _SAMPLES = 100_000  # pixels that tell which ones are bright
@@ -83,8 +85,11 @@ def _pile(image: np.ndarray, width: float) -> float:
     else:
         padded = np.concatenate([np.zeros(_NEIGHBOURS, int), count])
         below = np.max([padded[shift : shift + len(count)] for shift in range(_NEIGHBOURS)], axis=0)
-    enough = count >= (_LEAST_SPREAD if width else _LEAST_SATURATED)
-    piles = np.flatnonzero((values >= least) & enough & (count > _PILE * below) & (above <= _ABOVE * count))
+    enough = (count >= _LEAST_SPREAD) & (width * values >= _LEAST_WIDTH) if width else count >= _LEAST_SATURATED
+    piled = enough & (count > _PILE * below) & (above <= _ABOVE * count)
+    if not width:
+        piled |= (count >= _LEAST_SPREAD) & (count > _LAST * below) & (above <= _ABOVE_LAST * count)
+    piles = np.flatnonzero((values >= least) & piled)
     if not piles.size:
         return np.inf
     level = float(values[piles[np.argmax(count[piles])]]) * (1 - width)

@@ -56,6 +56,21 @@ def test_the_middles_of_microimages_in_8_bits_are_no_pile(gamma, end):
     assert saturated_share((255 * np.clip(white_image() / end, 0, 1) ** (1 / gamma)).round()) == 0
 
 
+@pytest.mark.parametrize("level", [255, 247, 239, 191])
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_noise_beside_a_pile_of_few_bits_does_not_hide_it(level, share):
+    """Noise of 2 % is five values wide in 8 bits, and each of them holds more than a quarter of the pile."""
+    white = white_image()
+    clipped = np.minimum((white * level / np.quantile(white, 1 - share)).round(), level)
+    assert saturated_share(clipped) == pytest.approx((clipped == level).sum() / (clipped > level / 2).sum())
+
+
+@pytest.mark.parametrize("noise", [0.45, 0.6, 0.8, 1.2, 2])
+def test_even_tops_of_microimages_are_no_pile_where_there_is_noise(noise):
+    tops = 200.3 + np.random.default_rng(4).normal(0, noise, (500, 500))
+    assert saturated_share(np.where(white_image() > 2500, tops, white_image() / 15).round()) == 0
+
+
 def test_a_white_image_that_is_mostly_clipped_is_saturated():
     assert saturated_share(np.minimum(white_image(), 2600).round()) > 0.5
 
