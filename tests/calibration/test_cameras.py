@@ -23,6 +23,7 @@ from lfpiv.calibration import checks, contradictions, coverage
 from lfpiv.calibration.board import hypotheses
 from lfpiv.calibration.board.board import agreeing_dots
 from lfpiv.calibration.coverage import warn_outside
+from lfpiv.calibration.measured_camera import input_errors
 from lfpiv.calibration.thin_lens_model import thin_lens_model
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.geometry.optics import LensLattice, Optics
@@ -64,6 +65,16 @@ def rig(tmp_path_factory, device):
     experiment = lfpiv.open_experiment(simulate(folder / "scene.toml", folder / "data"))
     spec = json.loads((folder / "data" / "truth" / "spec.json").read_text())["camera"][0]
     return experiment, spec, lfpiv.calibrate(experiment.path)  # from its file, as scripts do
+
+
+def test_a_fault_of_the_program_is_not_called_wrong_input():
+    """NumPy's errors of shapes and axes are kinds of ValueError, as InputError is."""
+    for fault in (lambda: np.zeros(3).sum(axis=2), lambda: np.zeros(3) + np.zeros(2)):
+        with pytest.raises(ValueError) as raised, input_errors("rig.toml"):
+            fault()
+        assert not isinstance(raised.value, lfpiv.InputError)
+    with pytest.raises(lfpiv.InputError, match=r"rig\.toml: few dots"), input_errors("rig.toml"):
+        raise lfpiv.InputError("few dots")
 
 
 def test_the_mapping_meets_the_true_rays(rig):
