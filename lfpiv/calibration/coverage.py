@@ -27,6 +27,8 @@ LEAST_SEEN = 0.5
 """Part of the volume seen by a camera below which a warning is due."""
 SEEN_SHARE = 0.1
 """Least sum of a voxel's weights in a camera that sees it, relative to the largest sum in the volume."""
+FITTED = 0.01
+"""Distance that is no distance [voxel]: a volume may end where dots are stated, which a fit moves by micrometres."""
 LEAST_UNPAIRED = 0.01
 """Part of the volume seen by fewer than two cameras above which a warning is due."""
 
@@ -123,7 +125,7 @@ def warn_outside(calibration: Calibration, grid: Grid) -> None:
 def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
     """Warn of every camera whose calibrated region does not hold all voxels of a grid.
 
-    The region is the box around the board's dots, half a voxel wider on each side.
+    The region is the box around the board's dots, half a voxel wider on each side, and by what fitted dots move.
     """
     warnings = []
     for camera in calibration.cameras.values():
@@ -133,8 +135,8 @@ def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
         for axis in range(3):
             centres = grid.axis_mm(2 - axis)
             low, high = camera.region_mm[:, axis]
-            over = np.maximum(np.maximum(low - centres, centres - high) - grid.voxel_mm / 2, 0.0)
-            inside *= float((over <= 1e-9).mean())
+            over = np.maximum(np.maximum(low - centres, centres - high) - (0.5 + FITTED) * grid.voxel_mm, 0.0)
+            inside *= float((over == 0).mean())
             distance = float(np.hypot(distance, over.max()))
         if inside == 1:
             continue

@@ -1,4 +1,7 @@
-"""Find images whose pixels of two bytes are not what the camera recorded: bytes exchanged, or a low byte of noise."""
+"""Find images whose pixels are not what the camera recorded.
+
+Bytes are exchanged, a low byte is noise, or numbers below zero became large ones.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,12 @@ ONE_HIGH_BYTE = 0.8
 """Share of the pixels with one high byte among which the low byte is judged."""
 EVEN = 0.8
 """Least of the counts of low bytes, relative to the largest, of noise."""
+END = 1 / 32
+"""Part of the range at either end in which noise about zero lies where numbers below zero are stored without a sign."""
+BELOW_ZERO = 0.01
+"""Least share of the pixels at the upper end that are such numbers; hot pixels are fewer."""
+LEAST_ZERO, MOST_BETWEEN = 0.25, 0.25
+"""Least share of their neighbours at the lower end, and largest share between both ends, as at edges of bright light."""
 
 _PIXELS = 300_000  # pixels that are compared, at most about
 _BINS = 16  # bins of the low byte
@@ -31,6 +40,11 @@ def fault(image: np.ndarray) -> str | None:
     """
     rows = image[:: 1 + image.size // _PIXELS]
     low, high = float(rows.min()), float(rows.max())
+    if low >= 0 and _wrapped(rows, 256 if high < 256 else _TWO_BYTES):
+        return (
+            "numbers below zero that became the largest ones, as when a background is subtracted from counts without a "
+            "sign. Save the image as recorded, or subtract in numbers with a sign and save those"
+        )
     if not (low >= 0 and 256 <= high < _TWO_BYTES) or (rows != np.rint(rows)).any():
         return None
     pixels = rows.astype(np.uint16)
@@ -46,6 +60,14 @@ def fault(image: np.ndarray) -> str | None:
     if chosen.size > max(_LEAST_PIXELS, ONE_HIGH_BYTE * pixels.size) and counts.min() > EVEN * counts.max():
         return "pixels whose low byte is noise: all its values are as frequent. Save the image again as recorded"
     return None
+
+
+def _wrapped(rows: np.ndarray, full: int) -> bool:
+    """Return whether noise about zero lies at both ends of a range of `full` values."""
+    upper, lower = rows >= full * (1 - END), rows < full * END
+    beside, count = upper[:, :-1], np.count_nonzero(upper[:, :-1])
+    zero, same = (np.count_nonzero(beside & one[:, 1:]) for one in (lower, upper))
+    return count > BELOW_ZERO * rows.size and zero > LEAST_ZERO * count and zero + same > (1 - MOST_BETWEEN) * count
 
 
 def _varies(values: np.ndarray) -> bool:

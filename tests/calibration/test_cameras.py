@@ -134,6 +134,10 @@ def test_a_volume_outside_the_board_is_warned_of_with_numbers(rig, caplog):
     _, _, calibration = rig
     with caplog.at_level(logging.WARNING):
         warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2, 2, 1.6), voxel_mm=0.1))
+        camera = calibration.cameras["only"]
+        fitted = dataclasses.replace(camera, region_mm=camera.region_mm * (1 - 1e-5))  # as a board's fit moves dots
+        whole = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(2.2, 2.2, 1.6), voxel_mm=0.1)
+        warn_outside(dataclasses.replace(calibration, cameras={"only": fitted}), whole)
         assert not caplog.records
         warn_outside(calibration, lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(4, 2, 1.6), voxel_mm=0.1))
     # 40 columns of voxels at -1.95 ... 1.95 mm; the board spans -1 ... 1 and half a voxel more, which holds 22 of them

@@ -37,3 +37,12 @@ def test_exchanged_bytes_and_a_low_byte_of_noise_are_named(light):
         assert "two bytes are exchanged" in fault(image.byteswap().astype(np.float32))
     noise = rng.integers(0, 256, SHAPE)
     assert "low byte is noise" in fault((256 * (light > 2000) + noise).astype(np.float32))
+
+
+@pytest.mark.parametrize(("dtype", "step"), [(np.uint16, 1), (np.uint8, 16)])
+def test_numbers_below_zero_without_a_sign_are_named(light, dtype, step):
+    below = (light.astype(int) - 40) // step
+    assert "below zero" in fault(below.astype(dtype).astype(np.float32))
+    assert fault(np.maximum(below, 0).astype(np.float32)) is None
+    saturated = np.minimum(np.maximum(below, 0) * 12, np.iinfo(dtype).max)
+    assert fault(saturated.astype(np.float32)) is None
