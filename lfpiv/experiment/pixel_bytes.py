@@ -22,7 +22,7 @@ END = 1 / 32
 BELOW_ZERO = 0.01
 """Least share of the pixels at the upper end that are such numbers; hot pixels are fewer."""
 LEAST_ZERO, MOST_BETWEEN = 0.25, 0.25
-"""Least share of their neighbours at the lower end, and largest share between both ends, as at edges of bright light."""
+"""Least share of their neighbours at the lower end, and largest share between both ends, as at edges of light."""
 
 _PIXELS = 300_000  # pixels that are compared, at most about
 _BINS = 16  # bins of the low byte
