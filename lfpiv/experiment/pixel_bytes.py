@@ -1,6 +1,6 @@
 """Find images whose pixels are not what the camera recorded.
 
-Bytes are exchanged, a low byte is noise, or numbers below zero became large ones.
+Bytes are exchanged, a low byte is noise, numbers below zero became large ones, or rows are of two exposures in turn.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ BELOW_ZERO = 0.01
 """Least share of the pixels at the upper end that are such numbers; hot pixels are fewer."""
 LEAST_ZERO, MOST_BETWEEN = 0.25, 0.25
 """Least share of their neighbours at the lower end, and largest share between both ends, as at edges of light."""
+INTERLACED = 1.1
+"""What correlation lacks from 1 between next rows, and rows three apart, relative to that of rows two apart, above which
+rows alternate; at most 1.01 in sound images."""
 
 _PIXELS = 300_000  # pixels that are compared, at most about
 _BINS = 16  # bins of the low byte
@@ -44,6 +47,13 @@ def fault(image: np.ndarray) -> str | None:
         return (
             "numbers below zero that became the largest ones, as when a background is subtracted from counts without a "
             "sign. Save the image as recorded, or subtract in numbers with a sign and save those"
+        )
+    middle = image[(len(image) - min(len(image), _PIXELS // image.shape[1])) // 2 :][: _PIXELS // image.shape[1]]
+    next_row, second, third = (_likeness(np.maximum(middle, 0).T, lag) for lag in (1, 2, 3))
+    if second > ALIKE and 1 - max(next_row, third) > INTERLACED * (1 - second):
+        return (
+            "rows of two exposures in turn, as interlaced video has them (neighbouring rows correlate by "
+            f"{next_row:.2f}, every other row by {second:.2f}). Record whole frames, without interlacing"
         )
     if not (low >= 0 and 256 <= high < _TWO_BYTES) or (rows != np.rint(rows)).any():
         return None
@@ -75,12 +85,13 @@ def _varies(values: np.ndarray) -> bool:
     return values.size > 0 and bool(np.bincount(values).max() <= LARGEST_SHARE * values.size)
 
 
-def _likeness(pixels: np.ndarray) -> float:
-    """Return the correlation of neighbours along the rows, in logarithms.
+def _likeness(pixels: np.ndarray, lag: int = 1) -> float:
+    """Return the correlation of pixels so far apart along the rows, in logarithms.
 
     Single bright pixels, hot or points, would outweigh all others: an exchange, which wraps them, would seem right.
     """
     values = np.log1p(pixels.astype(np.float32))
     values -= values.mean()
     power = float((values**2).mean(dtype=float))
-    return 1 - float((np.diff(values) ** 2).mean(dtype=float)) / (2 * power) if power > 0 else 0.0
+    apart = values[:, lag:] - values[:, :-lag]
+    return 1 - float((apart**2).mean(dtype=float)) / (2 * power) if power > 0 and apart.size else 0.0

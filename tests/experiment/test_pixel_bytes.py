@@ -46,3 +46,11 @@ def test_numbers_below_zero_without_a_sign_are_named(light, dtype, step):
     assert fault(np.maximum(below, 0).astype(np.float32)) is None
     saturated = np.minimum(np.maximum(below, 0) * 12, np.iinfo(dtype).max)
     assert fault(saturated.astype(np.float32)) is None
+
+
+def test_rows_of_two_exposures_in_turn_are_named(light):
+    later = np.roll(light, 4, axis=1)
+    later[::2] = light[::2]
+    assert "interlaced" in fault(later.astype(np.float32))
+    assert "interlaced" in fault((later // 16).astype(np.float32))
+    assert fault((light * np.where(np.arange(len(light)) % 2, 1.05, 1)[:, None]).round().astype(np.float32)) is None
