@@ -201,6 +201,8 @@ def _remedy(experiment: Experiment, names: list[str], what: str, flips: str) -> 
             f'point the other way, board.axes = "{other}".'
         )
     other = ", or the board images of two cameras are exchanged" if _facing(experiment, names) else ""
+    if what == "mirrored left to right" and not experiment.board.mark:  # a board without a mark looks alike upside down
+        flips += f", or {_flips(experiment, names, True, True)} where they are upside down, too"
     return f"{seen} Set {flips}. If the pictures do lie as stated, {key} has the wrong sign{other}. See `lfpiv check`."
 
 
