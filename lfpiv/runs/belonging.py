@@ -18,6 +18,7 @@ from lfpiv.lightfield.image_checks import dark_blocks
 from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles
+from lfpiv.runs.other_pairing import refusals_of_all
 from lfpiv.selfcalibration import dark_parts
 from lfpiv.selfcalibration.belonging import CLEAR, SURE, ImageFit, Judgement, judge
 from lfpiv.selfcalibration.disparity import SEARCH_VOXEL, CameraVolumes
@@ -76,6 +77,7 @@ def check(experiment: Experiment, weights: Weights, pairs: Iterable[int]) -> Agr
         refusals = _far_delay(experiment, names, as_judged, weights, list(judged))
     if not refusals and not any(one.in_order for one in judged.values()):
         refusals = _opposite_motion(experiment, as_judged, weights, tried)
+    refusals = refusals or refusals_of_all(shown, tried)
     if refusals:
         refusals = refusals if scales is None else [scales]  # such images do not tell what else is wrong
         return _told(

@@ -1,0 +1,45 @@
+"""Paired frames: how alike two frames of one camera are, so which frames show the same particles.
+
+Light is summed over microlenses, which the displacement of particles between exposures moves as a whole. Frames of one
+pair correlate at that displacement; those of other pairs by chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import fft
+
+from lfpiv.calibration.camera import CalibratedCamera
+
+REACH_LENSES = 8
+"""Largest displacement of particles that is sought [microlens pitch]."""
+ALIKE = 0.15
+"""Least excess of the likeness of frames that show the same particles over that of frames that do not."""
+UNLIKE = 1 / 3
+"""Largest such excess of the frames of a pair that do not, relative to that of the frames that do."""
+
+
+def likeness(
+    first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], cameras: Mapping[str, CalibratedCamera]
+) -> float:
+    """Return the highest correlation of two frames over displacements, a mean over the cameras."""
+    return float(np.mean([_highest(first[name], second[name], camera) for name, camera in cameras.items()]))
+
+
+def _highest(first: np.ndarray, second: np.ndarray, camera: CalibratedCamera) -> float:
+    step = round(camera.optics.microimage_pitch_px)
+    one, other = (_summed(image, step) for image in (first, second))
+    shape = [2 * count for count in one.shape]
+    product = fft.irfft2(fft.rfft2(one, shape).conj() * fft.rfft2(other, shape), shape)
+    near = np.roll(product, (REACH_LENSES, REACH_LENSES), (0, 1))[: 2 * REACH_LENSES + 1, : 2 * REACH_LENSES + 1]
+    return float(near.max()) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-30)
+
+
+def _summed(image: np.ndarray, step: int) -> np.ndarray:
+    """Return the roots of the light in squares of a microlens, less their mean. Few bright particles hardly count."""
+    rows, columns = (count // step for count in image.shape)
+    roots = np.sqrt(np.maximum(image[: rows * step, : columns * step], 0, dtype=np.float32))
+    squares: np.ndarray = roots.reshape(rows, step, columns, step).mean((1, 3))
+    return squares - squares.mean()
