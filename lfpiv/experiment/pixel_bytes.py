@@ -77,7 +77,9 @@ def _wrapped(rows: np.ndarray, full: int) -> bool:
     upper, lower = rows >= full * (1 - END), rows < full * END
     beside, count = upper[:, :-1], np.count_nonzero(upper[:, :-1])
     zero, same = (np.count_nonzero(beside & one[:, 1:]) for one in (lower, upper))
-    return count > BELOW_ZERO * rows.size and zero > LEAST_ZERO * count and zero + same > (1 - MOST_BETWEEN) * count
+    return bool(
+        count > BELOW_ZERO * rows.size and zero > LEAST_ZERO * count and zero + same > (1 - MOST_BETWEEN) * count
+    )
 
 
 def _varies(values: np.ndarray) -> bool:

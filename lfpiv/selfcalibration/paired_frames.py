@@ -42,4 +42,5 @@ def _summed(image: np.ndarray, step: int) -> np.ndarray:
     rows, columns = (count // step for count in image.shape)
     roots = np.sqrt(np.maximum(image[: rows * step, : columns * step], 0, dtype=np.float32))
     squares: np.ndarray = roots.reshape(rows, step, columns, step).mean((1, 3))
-    return squares - squares.mean()
+    squares -= squares.mean()
+    return squares
