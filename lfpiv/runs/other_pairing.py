@@ -1,7 +1,7 @@
 """Find runs whose pairs are made of other frames than those that show the same particles, in all cameras.
 
 An image too many or too few at the start of a recording shifts all others. The cameras of a frame still agree. So only
-the frames tell it: those of a pair are as unlike as those of other pairs, and those of neighbouring pairs are alike.
+the frames of a pair tell it: they are as unlike as frames of any pairs, while frames of neighbouring pairs are alike.
 """
 
 from __future__ import annotations
