@@ -24,8 +24,8 @@ BELOW_ZERO = 0.01
 LEAST_ZERO, MOST_BETWEEN = 0.25, 0.25
 """Least share of their neighbours at the lower end, and largest share between both ends, as at edges of light."""
 INTERLACED = 1.1
-"""Ratio above which rows alternate, at most 1.01 in sound images. What the correlation of rows lacks from 1, one or three
-rows apart, is divided by the same for rows two apart."""
+"""Ratio above which rows alternate, at most 1.01 in sound images: what the correlation of rows lacks from 1, one or
+three rows apart, over the same for rows two apart."""
 
 _PIXELS = 300_000  # pixels that are compared, at most about
 _BINS = 16  # bins of the low byte
