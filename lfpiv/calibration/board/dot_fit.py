@@ -145,27 +145,6 @@ def fit_dots(
     ]
 
 
-def _pixels_around(model: LensIntegral, pixels: BoardPixels, dot: ExpectedDot, margin_mm: float) -> np.ndarray:
-    """Return rows and columns of the usable pixels that may see a dot and none of its neighbours, shape (n, 2)."""
-    decoder, optics = pixels.decoder, model.optics
-    support = model.support_mm(dot.board_jacobian, dot.theta)
-    reach = support + margin_mm + model.pupil_reach_mm(dot.theta) + optics.microlens_pitch_mm
-    corners = optics.sensor_px((dot.theta[0] + [-reach, reach]) * (1 + optics.sensor_per_pupil))
-    low = np.maximum(np.floor(corners[0]), 0).astype(int)
-    high = np.maximum(np.ceil(corners[1]) + 1, low).astype(int)
-    row, column = np.nonzero(pixels.usable[low[1] : high[1], low[0] : high[0]])
-    at = (row + low[1], column + low[0])
-    terms = model.pixel_terms(decoder.pupil_mm[at])
-    offset, _ = model.offset_mm(terms, dot.theta, decoder.lattice.centres_mm(decoder.lens_index[at]))
-    take = (np.abs(offset) < support + margin_mm).all(1)
-    inverse = np.linalg.inv(np.eye(2) - slope_of(dot.theta, optics.pupil_radius_mm))
-    for neighbour in dot.neighbours_mm @ inverse.T:
-        if (np.abs(neighbour) < 2 * support + margin_mm).all():
-            take &= (np.abs(offset - neighbour) > support).any(1)
-    chosen: np.ndarray = np.stack(at, axis=1)[take]
-    return chosen
-
-
 @dataclass(frozen=True, eq=False)
 class _State:
     """The model evaluated at one set of parameters."""
@@ -203,23 +182,38 @@ class _Problem:
         signal: np.ndarray,
         margin_mm: float,
     ) -> _Problem:
-        where = _pixels_around(model, pixels, dot, margin_mm)
-        where = where[~np.isnan(signal[tuple(where.T)])]
-        at = (where[:, 0], where[:, 1])
-        decoder = pixels.decoder
+        """Take the usable pixels that may see a dot and none of its neighbours."""
+        decoder, optics = pixels.decoder, model.optics
+        support = model.support_mm(dot.board_jacobian, dot.theta)
+        reach = support + margin_mm + model.pupil_reach_mm(dot.theta) + optics.microlens_pitch_mm
+        corners = optics.sensor_px((dot.theta[0] + [-reach, reach]) * (1 + optics.sensor_per_pupil))
+        low = np.maximum(np.floor(corners[0]), 0).astype(int)
+        high = np.maximum(np.ceil(corners[1]) + 1, low).astype(int)
+        part = np.s_[low[1] : high[1], low[0] : high[0]]
+        pixel = np.argwhere(pixels.usable[part] & ~np.isnan(signal[part])) + low[::-1]
+        at = tuple(pixel.T)
         pupil = decoder.pupil_mm[at].astype(float)
+        terms, lens = model.pixel_terms(pupil), decoder.lattice.centres_mm(decoder.lens_index[at])
+        offset, _ = model.offset_mm(terms, dot.theta, lens)
+        take = (np.abs(offset) < support + margin_mm).all(1)
+        inverse = np.linalg.inv(np.eye(2) - slope_of(dot.theta, optics.pupil_radius_mm))
+        for neighbour in dot.neighbours_mm @ inverse.T:
+            if (np.abs(neighbour) < 2 * support + margin_mm).all():
+                take &= (np.abs(offset - neighbour) > support).any(1)
+        pixel = pixel[take]
+        at = tuple(pixel.T)
         return cls(
             model=model,
             dot=dot,
             sign=pixels.sign,
             noise_variance=pixels.signals.noise**2,
             counts_per_photon=pixels.counts_per_photon,
-            pixel=where,
+            pixel=pixel,
             signal=signal[at].astype(float),
             response=pixels.response[at].astype(float),
-            pupil_mm=pupil,
-            lens_mm=decoder.lattice.centres_mm(decoder.lens_index[at]),
-            terms=model.pixel_terms(pupil),
+            pupil_mm=pupil[take],
+            lens_mm=lens[take],
+            terms=terms[take],
         )
 
     def table(self, theta: np.ndarray) -> LensTable:
