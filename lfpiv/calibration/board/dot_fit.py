@@ -260,42 +260,46 @@ class _Problem:
         pixels = float((size**2 - np.maximum(size - _ROBUST_SIGMA, 0) ** 2).sum())
         return pixels + float(miss @ self.dot.information @ miss)
 
+    def _linearised(self, state: _State, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return derivatives of the light over the dot's unknowns, (n, 14), and over s and t, (2, n); weights."""
+        along = state.linear[1] * self.response * np.stack(state.along)
+        own = self.terms[:, :TERMS]
+        light = np.stack([self.response, self.response * state.share], axis=1)
+        size = np.abs(state.misfit) * np.sqrt(weight)
+        robust = weight * _ROBUST_SIGMA / np.maximum(size, _ROBUST_SIGMA)
+        return np.hstack([along[0][:, None] * own, along[1][:, None] * own, light]), along, robust
+
     def normal_equations(
         self, state: _State, weight: np.ndarray, shared: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the Gauss-Newton matrix and right-hand side of the dot's unknowns, then of the shared parameters."""
-        strength = state.linear[1] * self.response
-        along = [(strength * along)[:, None] for along in state.along]
-        own, bend = self.terms[:, :TERMS], self.terms[:, TERMS:]
-        columns = [along[0] * own, along[1] * own, self.response[:, None], (self.response * state.share)[:, None]]
+        jacobian, along, robust = self._linearised(state, weight)
         if shared:
-            columns += [strength[:, None] * state.growth, along[0] * bend, along[1] * bend]
-        jacobian = np.hstack(columns)
-        size = np.abs(state.misfit) * np.sqrt(weight)
-        weighted = jacobian * (weight * _ROBUST_SIGMA / np.maximum(size, _ROBUST_SIGMA))[:, None]
+            growth, bend = (state.linear[1] * self.response)[:, None] * state.growth, self.terms[:, TERMS:]
+            jacobian = np.hstack([jacobian, growth, along[0][:, None] * bend, along[1][:, None] * bend])
+        weighted = jacobian * robust[:, None]
         normal, gradient = weighted.T @ jacobian, weighted.T @ state.misfit
         normal[:_RAYS, :_RAYS] += self.dot.information
         gradient[:_RAYS] -= self.dot.information @ self._miss(state)
         return normal, gradient
 
-    def zone_equations(self, state: _State, weight: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the right-hand side and the matrix of the zones' displacements; `inverse` eliminates the dot's own."""
-        zone = zone_of(self.pupil_mm / self.model.optics.pupil_radius_mm)
-        strength = state.linear[1] * self.response
-        along = [(strength * along)[:, None] for along in state.along]
-        own = self.terms[:, :TERMS]
-        columns = [along[0] * own, along[1] * own, self.response[:, None], (self.response * state.share)[:, None]]
-        jacobian = np.hstack(columns)
-        size = np.abs(state.misfit) * np.sqrt(weight)
-        weight = weight * _ROBUST_SIGMA / np.maximum(size, _ROBUST_SIGMA)
-        inside = zone[:, None] == np.arange(ZONES)
-        zones = np.hstack([along[0] * inside, along[1] * inside])
-        weighted = zones.T * weight
-        mixed = weighted @ jacobian
+    def zone_equations(
+        self, state: _State, weight: np.ndarray, inverse: np.ndarray, gradient: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the right-hand side and the matrix of the displacements in the zones.
+
+        `inverse` of the dot's own normal matrix and their right-hand side `gradient` eliminate the dot's unknowns.
+        """
+        jacobian, along, robust = self._linearised(state, weight)
+        zone, zones = zone_of(self.pupil_mm / self.model.optics.pupil_radius_mm), np.arange(ZONES)
+        inside = (zone == zones[:, None]).astype(float)
+        columns = np.hstack([jacobian, along.T, state.misfit[:, None]])
+        sums = np.stack([inside @ ((robust * one)[:, None] * columns) for one in along])  # (2, ZONES, columns)
+        alone = np.zeros((2, ZONES, 2, ZONES))  # no pixel is in two zones
+        alone[:, zones, :, zones] = sums[..., _OWN:-1].swapaxes(0, 1)
+        mixed = sums[..., :_OWN].reshape(2 * ZONES, _OWN)
         hidden = mixed @ inverse
-        gradient = jacobian.T @ (weight * state.misfit)
-        gradient[:_RAYS] -= self.dot.information @ self._miss(state)
-        return weighted @ state.misfit - hidden @ gradient, weighted @ zones - hidden @ mixed.T
+        return sums[..., -1].ravel() - hidden @ gradient, alone.reshape(2 * ZONES, -1) - hidden @ mixed.T
 
     def _miss(self, state: _State) -> np.ndarray:
         miss: np.ndarray = (state.theta - self.dot.theta).T.ravel()
@@ -356,7 +360,7 @@ def _summarise(problem: _Problem, state: _State, converged: bool) -> DotFit:
     normal, gradient = problem.normal_equations(state, weight, shared=True)
     inverse = np.linalg.inv(normal[:_OWN, :_OWN])
     hidden = normal[_OWN:, :_OWN] @ inverse
-    zone_pull, zone_information = problem.zone_equations(state, weight, inverse)
+    zone_pull, zone_information = problem.zone_equations(state, weight, inverse, gradient[:_OWN])
     relative = state.misfit / np.maximum(np.abs(state.linear[1]) * problem.response, 1e-12)
     return DotFit(
         coefficients=state.theta,

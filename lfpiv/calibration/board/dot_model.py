@@ -167,7 +167,9 @@ class LensIntegral:
 
     def support_mm(self, board_jacobian: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the half extent (s, t) of F [mm]: a lens further away receives no light of the dot, shape (2,)."""
-        ellipse, pixel = self._ellipse(board_jacobian, theta), self._pixel(theta)
+        return self._support_mm(self._ellipse(board_jacobian, theta), self._pixel(theta))
+
+    def _support_mm(self, ellipse: np.ndarray, pixel: np.ndarray) -> np.ndarray:
         blurred = np.abs(pixel).sum(1) * (0.5 + 2 * self.shared.blur_px)
         extent: np.ndarray = self.cell_reach_mm + np.hypot(*ellipse.T) + blurred
         return extent
@@ -186,11 +188,10 @@ class LensIntegral:
         """
         inverse = np.linalg.inv(np.eye(2) - slope_of(theta, self.optics.pupil_radius_mm))
         change = [inverse @ tilt[:, :, axis] * (self.shared.diameter_mm / 2) for axis in (0, 1)]
-        size = int(np.ceil(np.log(self.support_mm(board_jacobian, theta).max()) / _SIZE_STEP))
-        step = _TABLE_SUPPORTS * np.exp(size * _SIZE_STEP) / TABLE
-        cell = _cell_spectrum(self._basis, step)
         ellipse, pixel = self._ellipse(board_jacobian, theta), self._pixel(theta)
-        return LensTable(cell, step, ellipse, pixel, self.shared.blur_px, change)
+        size = int(np.ceil(np.log(self._support_mm(ellipse, pixel).max()) / _SIZE_STEP))
+        step = _TABLE_SUPPORTS * np.exp(size * _SIZE_STEP) / TABLE
+        return LensTable(_cell_spectrum(self._basis, step), step, ellipse, pixel, self.shared.blur_px, change)
 
     def _bent(self, theta: np.ndarray) -> np.ndarray:
         return np.vstack([theta, self.shared.bend_mm])
