@@ -298,7 +298,8 @@ def _fit_mapping(
     region_mm, radius = np.stack([points.min(0), points.max(0)]), setup.optics.pupil_radius_mm
     with input_errors(place):
         chosen = train_several(trained, region_mm, radius, seed=settings.seed, unit=pitch_mm)
-        halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed) / pitch_mm
+        by_chance = chosen.error * pitch_mm
+        halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed, by_chance) / pitch_mm
     training, inputs = chosen.training, np.hstack([points, pupil])
     chance = max(chosen.error, training.sigma_nor if math.isnan(halves) else halves)
     unfollowed = smooth_departure(inputs, target - training.network(inputs), dots.dot[agreeing]) / pitch_mm
