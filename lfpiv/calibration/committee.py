@@ -39,9 +39,8 @@ RAYS = 2000
 """Rays on which networks are compared."""
 FEWEST_DOTS = 40
 """Least number of dots that are halved."""
-SPLITS, UNLUCKY = 3, 2.5
-"""Ways to halve the dots if the first way gives this many times the error of the chosen network by chance. An unlucky
-network of a half gave nine times the distance of other halves, 2 is usual where the labels' noise prevails."""
+SPLITS = 3
+"""Pairs of halves where networks scatter by more than the held-out dots show: one network of a half may be unlucky."""
 CHANCE = 1e-3
 """Probability that labels about a mapping that follows them show a smooth departure by chance."""
 
@@ -134,7 +133,7 @@ def distance_of_halves(
     region_mm: np.ndarray,
     pupil_radius_mm: float,
     seed: int,
-    by_chance: float,
+    splits: int = 1,
 ) -> float:
     """Return the mean error of a mapping that the noise of its labels makes, from mappings of half of the dots each.
 
@@ -149,9 +148,8 @@ def distance_of_halves(
         Number of each label's dot.
     region_mm, pupil_radius_mm, seed
         As `nearest_to_others` takes them.
-    by_chance : float
-        `Chosen.error`, in the unit of the mappings' outputs. If the halves differ by `UNLUCKY` times as much, the
-        median of `SPLITS` pairs of halves is taken: a single network may be unlucky.
+    splits : int
+        Pairs of halves, of which the median is taken.
 
     Returns
     -------
@@ -162,16 +160,13 @@ def distance_of_halves(
     if len(dots) < FEWEST_DOTS:
         return np.nan
 
-    def of_split() -> float:
+    errors = []
+    for _ in range(splits):
         half = np.isin(dot, rng.permutation(dots)[: len(dots) // 2])
         rays = rng.uniform(low, high, (RAYS, 3)), random_on_pupil(INNER * pupil_radius_mm, RAYS, rng)
         apart = fit(half)(*rays) - fit(~half)(*rays)
-        return float(np.linalg.norm(apart, axis=1).mean() / 2)
-
-    first = of_split()
-    return (
-        first if first <= UNLUCKY * by_chance else float(np.median([first, *(of_split() for _ in range(SPLITS - 1))]))
-    )
+        errors.append(np.linalg.norm(apart, axis=1).mean() / 2)
+    return float(np.median(errors))
 
 
 def smooth_departure(inputs: np.ndarray, departure: np.ndarray, dot: np.ndarray) -> float:

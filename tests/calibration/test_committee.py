@@ -121,22 +121,22 @@ def test_half_the_distance_of_two_halves_is_the_error_that_noise_makes():
             smooth = np.linalg.lstsq(terms(rays[part, :3], 0), (labels - places(rays))[part], rcond=None)[0]
             return lambda points, pupil: terms(points, pupil) @ smooth
 
-        found.append(distance_of_halves(fit, dot, REGION_MM, PUPIL_MM, seed, np.inf))
+        found.append(distance_of_halves(fit, dot, REGION_MM, PUPIL_MM, seed))
     expected = NOISE_MM * np.sqrt(10 / DOTS) * np.sqrt(np.pi / 2)
     assert np.mean(found) == pytest.approx(expected, rel=0.15)  # of twenty draws, each with ten unknowns
-    assert np.isnan(distance_of_halves(fit, dot % 30, REGION_MM, PUPIL_MM, 0, np.inf))
+    assert np.isnan(distance_of_halves(fit, dot % 30, REGION_MM, PUPIL_MM, 0))
 
 
-@pytest.mark.parametrize(("by_chance", "expected"), [(1.0, 1.0), (6.0, 9.0)])
-def test_an_unlucky_network_of_a_half_is_outvoted(by_chance, expected):
-    """The first half is displaced by 18 (halves of the distance count), as networks that scatter by 6 may be."""
+@pytest.mark.parametrize(("splits", "expected"), [(1, 9.0), (3, 1.0)])
+def test_an_unlucky_network_of_a_half_is_outvoted(splits, expected):
+    """The first half is displaced by 18, and half of the distance counts."""
     displaced = iter([18.0, 0.0, 2.0, 0.0, 0.0, 2.0])
 
     def fit(part):
         shift = next(displaced)
         return lambda points, pupil: np.column_stack([np.full(len(points), shift), np.zeros(len(points))])
 
-    assert distance_of_halves(fit, np.arange(100), REGION_MM, PUPIL_MM, 0, by_chance) == pytest.approx(expected)
+    assert distance_of_halves(fit, np.arange(100), REGION_MM, PUPIL_MM, 0, splits) == pytest.approx(expected)
 
 
 def test_a_mapping_that_does_not_follow_its_labels_departs_smoothly():
