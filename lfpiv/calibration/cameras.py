@@ -298,7 +298,7 @@ def _fit_mapping(
     region_mm, radius = np.stack([points.min(0), points.max(0)]), setup.optics.pupil_radius_mm
     with input_errors(place):
         chosen = train_several(trained, region_mm, radius, seed=settings.seed, unit=pitch_mm)
-        splits = SPLITS if chosen.scatter >= chosen.training.sigma_nor else 1
+        splits = SPLITS if chosen.scatters() else 1
         halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed, splits) / pitch_mm
     training, inputs = chosen.training, np.hstack([points, pupil])
     chance = max(chosen.error, training.sigma_nor if math.isnan(halves) else halves)

@@ -40,7 +40,7 @@ RAYS = 2000
 FEWEST_DOTS = 40
 """Least number of dots that are halved."""
 SPLITS = 3
-"""Pairs of halves where networks scatter by more than the held-out dots show: one network of a half may be unlucky."""
+"""Pairs of halves to take where networks scatter: the network of a half may be unlucky."""
 CHANCE = 1e-3
 """Probability that labels about a mapping that follows them show a smooth departure by chance."""
 
@@ -59,6 +59,10 @@ class Chosen:
     since both ends of a distance have errors. A few networks that are far off do not change a median."""
     error: float
     """Error of this network by chance: its distance to the median of all, and the standard error of that median."""
+
+    def scatters(self, unit: float = 1.0) -> bool:
+        """Return whether networks scatter by more than the held-out dots show; `unit` is as in `train_several` [mm]."""
+        return self.scatter >= self.training.sigma_nor * unit
 
 
 def train_several(
@@ -84,7 +88,7 @@ def train_several(
     """
     trainings = [train(seed + number) for number in range(NETWORKS)]
     found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
-    while found.scatter >= found.training.sigma_nor * unit and len(trainings) < MOST_NETWORKS:
+    while found.scatters(unit) and len(trainings) < MOST_NETWORKS:
         trainings.append(train(seed + len(trainings)))
         found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
     number = trainings.index(found.training) + 1
@@ -159,7 +163,6 @@ def distance_of_halves(
     rng, (low, high), dots = np.random.default_rng(seed), region_mm, np.unique(dot)
     if len(dots) < FEWEST_DOTS:
         return np.nan
-
     errors = []
     for _ in range(splits):
         half = np.isin(dot, rng.permutation(dots)[: len(dots) // 2])

@@ -28,7 +28,10 @@ LEAST_SEEN = 0.5
 SEEN_SHARE = 0.1
 """Least sum of a voxel's weights in a camera that sees it, relative to the largest sum in the volume."""
 FITTED = 0.01
-"""Distance that is no distance [voxel]: a volume may end where dots are stated, which a fit moves by micrometres."""
+"""Tolerance at the edge of the calibrated region [voxel].
+
+A volume may end at the stated dots, and the fit of the board moves dots by micrometres.
+"""
 LEAST_UNPAIRED = 0.01
 """Part of the volume seen by fewer than two cameras above which a warning is due."""
 
@@ -125,7 +128,7 @@ def warn_outside(calibration: Calibration, grid: Grid) -> None:
 def outside_warnings(calibration: Calibration, grid: Grid) -> list[Warning]:
     """Warn of every camera whose calibrated region does not hold all voxels of a grid.
 
-    The region is the box around the board's dots, half a voxel wider on each side, and by what fitted dots move.
+    The region is the box around the board's dots, half a voxel and `FITTED` wider on each side.
     """
     warnings = []
     for camera in calibration.cameras.values():

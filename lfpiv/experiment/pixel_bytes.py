@@ -5,6 +5,8 @@ Bytes are exchanged, a low byte is noise, numbers below zero became large ones, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 ALIKE = 0.3
@@ -24,8 +26,10 @@ BELOW_ZERO = 0.01
 LEAST_ZERO, MOST_BETWEEN = 0.25, 0.25
 """Least share of their neighbours at the lower end, and largest share between both ends, as at edges of light."""
 INTERLACED = 1.1
-"""Ratio above which rows alternate, at most 1.01 in sound images: what the correlation of rows lacks from 1, one or
-three rows apart, over the same for rows two apart."""
+"""Ratio above which rows are of two exposures; sound images give at most 1.01.
+
+It compares what correlations of rows lack from 1: rows one or three apart, over rows two apart.
+"""
 
 _PIXELS = 300_000  # pixels that are compared, at most about
 _BINS = 16  # bins of the low byte
@@ -49,7 +53,7 @@ def fault(image: np.ndarray) -> str | None:
             "sign. Save the image as recorded, or subtract in numbers with a sign and save those"
         )
     middle = image[(len(image) - min(len(image), _PIXELS // image.shape[1])) // 2 :][: _PIXELS // image.shape[1]]
-    next_row, second, third = (_likeness(np.maximum(middle, 0).T, lag) for lag in (1, 2, 3))
+    next_row, second, third = _likeness(np.maximum(middle, 0).T, (1, 2, 3))
     if second > ALIKE and 1 - max(next_row, third) > INTERLACED * (1 - second):
         return (
             "rows of two exposures in turn, as interlaced video has them (neighbouring rows correlate by "
@@ -58,7 +62,7 @@ def fault(image: np.ndarray) -> str | None:
     if not (low >= 0 and 256 <= high < _TWO_BYTES) or (rows != np.rint(rows)).any():
         return None
     pixels = rows.astype(np.uint16)
-    alike, exchanged = _likeness(pixels), _likeness(pixels.byteswap())
+    (alike,), (exchanged,) = _likeness(pixels, (1,)), _likeness(pixels.byteswap(), (1,))
     if _varies(pixels[pixels > 0] >> 8) and exchanged > ALIKE and 1 - alike > UNLIKE * (1 - exchanged):
         return (
             f"pixels whose two bytes are exchanged (neighbours correlate by {alike:.2f}, by {exchanged:.2f} after an "
@@ -87,13 +91,15 @@ def _varies(values: np.ndarray) -> bool:
     return values.size > 0 and bool(np.bincount(values).max() <= LARGEST_SHARE * values.size)
 
 
-def _likeness(pixels: np.ndarray, lag: int = 1) -> float:
-    """Return the correlation of pixels so far apart along the rows, in logarithms.
+def _likeness(pixels: np.ndarray, lags: Sequence[int]) -> list[float]:
+    """Return the correlation of pixels along the rows, in logarithms, at each distance in `lags`.
 
     Single bright pixels, hot or points, would outweigh all others: an exchange, which wraps them, would seem right.
     """
     values = np.log1p(pixels.astype(np.float32))
     values -= values.mean()
     power = float((values**2).mean(dtype=float))
-    apart = values[:, lag:] - values[:, :-lag]
-    return 1 - float((apart**2).mean(dtype=float)) / (2 * power) if power > 0 and apart.size else 0.0
+    if power == 0:
+        return [0.0 for _ in lags]
+    steps = [values[:, lag:] - values[:, :-lag] for lag in lags]
+    return [1 - float((step**2).mean(dtype=float)) / (2 * power) if step.size else 0.0 for step in steps]

@@ -1,7 +1,8 @@
 """Find runs whose pairs are made of other frames than those that show the same particles, in all cameras.
 
-An image too many or too few at the start of a recording shifts all others. The cameras of a frame still agree. So only
-the frames of a pair tell it: they are as unlike as frames of any pairs, while frames of neighbouring pairs are alike.
+An image too many or too few at the start of a recording shifts all others. The cameras of a frame still agree. The
+frames of a pair show the mistake: they are as unlike as frames of different pairs, and frames of neighbouring pairs are
+alike.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ def refusals_of_all(shown: ShownParticles, pairs: Sequence[int]) -> list[Warning
         other = min(linked) - chance if len(linked) >= _FEWEST else 0.0  # images that stay the same are alike once
         if other > ALIKE and own < UNLIKE * other:
             one, next_one = (f"{recording.exposure} {recording.both[frame]}" for frame in frames)
-            found = f"{one} of each pair shows the particles of {next_one} of the next pair, not those of its own pair"
+            found = (
+                f"{one} of each pair shows the particles of {next_one} of the next pair, not the particles of its own"
+            )
             remedy = "Number the images anew: one too many, or too few, at the start shifts all others"
             return [Warning(code=Code.MISMATCHED, figures={"found": found, "remedy": remedy})]
     return []

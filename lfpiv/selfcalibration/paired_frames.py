@@ -1,7 +1,7 @@
-"""Paired frames: how alike two frames of one camera are, so which frames show the same particles.
+"""Measure how alike two frames of a camera are: this tells which frames show the same particles.
 
-Light is summed over microlenses, which the displacement of particles between exposures moves as a whole. Frames of one
-pair correlate at that displacement; those of other pairs by chance.
+Light is summed over microlenses. The displacement of particles between exposures moves it as a whole. Frames of a pair
+correlate at this displacement, frames of different pairs by chance.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from lfpiv.calibration.camera import CalibratedCamera
 REACH_LENSES = 8
 """Largest displacement of particles that is sought [microlens pitch]."""
 ALIKE = 0.15
-"""Least excess of the likeness of frames that show the same particles over that of frames that do not."""
+"""Least likeness of frames that show the same particles, above the likeness of other frames."""
 UNLIKE = 1 / 3
-"""Largest such excess of the frames of a pair that do not, relative to that of the frames that do."""
+"""Most likeness of the frames of a wrong pair above chance, relative to the frames that belong together."""
 
 
 def likeness(

@@ -170,7 +170,7 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.DOT_WIDTH: (
         "the board's dots look {seen_mm:.3g} mm wide, not {stated_mm:.3g} mm; the calibration takes what is seen. "
-        "Check board.dot_diameter_mm, focus and exposure. Or the lens bends its outer rays: a higher f-number lowers it"
+        "Check board.dot_diameter_mm, focus and exposure. If the lens bends its outer rays, use a higher f-number"
     ),
     Code.DOTS_MISSING: (
         "only {found} of {expected} board dots in the field were found; check focus, exposure and the planes listed "
