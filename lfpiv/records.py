@@ -117,8 +117,7 @@ def validate(kind: type[T], stored: Any) -> T:
 
     try:
         text = json.dumps(stored)
-        found: T = _adapter(kind).validate_json(text, strict=True)  # type: ignore[arg-type]  # a type is hashable
-        return found
+        return _adapter(kind).validate_json(text, strict=True)  # type: ignore[arg-type]  # a type is hashable
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         place = ".".join(map(str, first["loc"]))

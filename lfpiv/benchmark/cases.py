@@ -134,10 +134,6 @@ def scene_of(case: Case, *, seed: int | None = None, tracers: str | Path | None 
     tracers : path, optional
         File of tracers, for a case with a table `tracers`.
 
-    Returns
-    -------
-    Scene
-
     Raises
     ------
     InputError
@@ -159,8 +155,7 @@ def scene_of(case: Case, *, seed: int | None = None, tracers: str | Path | None 
 
 def public_seed(case: Case) -> int:
     """Return the seed of a case that everybody knows."""
-    seed: int = tables_of(case)["seed"]
-    return seed
+    return tables_of(case)["seed"]
 
 
 class _Seeded(Table):

@@ -83,10 +83,6 @@ def fingerprint_of(folder: Path, truth: Path) -> Fingerprint:
         Folder of the data set, with images in TIFF files.
     truth : Path
         Folder of its truth.
-
-    Returns
-    -------
-    Fingerprint
     """
     with np.load(truth / "particles.npz") as arrays:
         particles = {name: arrays[name] for name in sorted(arrays.files)}

@@ -90,10 +90,6 @@ def make(
     progress : callable, optional
         Called with (step, finished fraction).
 
-    Returns
-    -------
-    list of Made
-
     Raises
     ------
     InputError

@@ -55,14 +55,12 @@ class MeasuredField:
     @cached_property
     def kept(self) -> np.ndarray:
         """Which vectors are stated as measured and are numbers, shape (vector,)."""
-        finite: np.ndarray = self.finite & self.valid
-        return finite
+        return self.finite & self.valid
 
     @cached_property
     def finite(self) -> np.ndarray:
         """Which vectors are numbers, replaced ones included, shape (vector,)."""
-        finite: np.ndarray = np.isfinite(self.displacement_mm).all(1) & np.isfinite(self.positions_mm).all(1)
-        return finite
+        return np.isfinite(self.displacement_mm).all(1) & np.isfinite(self.positions_mm).all(1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

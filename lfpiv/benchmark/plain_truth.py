@@ -52,8 +52,7 @@ def recommended_grid(scene: Scene) -> VectorGrid:
 
     def axis(size: float, centre: float) -> np.ndarray:
         count = 1 + max(0, int((size - window) / spacing + 1e-9))
-        places: np.ndarray = np.round(centre + (np.arange(count) - (count - 1) / 2) * spacing, 9)
-        return places
+        return np.round(centre + (np.arange(count) - (count - 1) / 2) * spacing, 9)
 
     size: Point = scene.volume.size_mm
     x, y, z = (axis(edge, middle) for edge, middle in zip(size, scene.volume.centre_mm, strict=True))

@@ -53,8 +53,7 @@ class PairErrors:
     @property
     def error(self) -> np.ndarray:
         """Measured minus true displacement, shape (vector, 3)."""
-        difference: np.ndarray = self.measured - self.true
-        return difference
+        return self.measured - self.true
 
     @property
     def completeness(self) -> float:
@@ -119,8 +118,7 @@ class Sample:
         order = np.argsort(length, kind="stable")  # a bootstrap takes many quantiles, which is fast in sorted values
 
         def joined(parts: Iterable[np.ndarray]) -> np.ndarray:
-            values: np.ndarray = np.concatenate(list(parts))[order]
-            return values
+            return np.concatenate(list(parts))[order]
 
         self.length = length[order]
         self.measured = joined(one.measured for one in pairs)

@@ -116,10 +116,6 @@ def score_results(
     progress : callable, optional
         Called with the finished fraction.
 
-    Returns
-    -------
-    list of Score
-
     Raises
     ------
     InputError

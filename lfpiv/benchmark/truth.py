@@ -96,8 +96,7 @@ class Truth:
         near = np.all(np.abs(points_mm - self.scene.volume.centre_mm) <= half, axis=1)
         if self.scene.wall is not None:
             near[near] = ~self.scene.solid(points_mm[near])
-        fluid: np.ndarray = near
-        return fluid
+        return near
 
     @cached_property
     def samples_mm(self) -> np.ndarray:
@@ -109,8 +108,7 @@ class Truth:
             for centre, edge, count in zip(self.scene.volume.centre_mm, size, counts, strict=True)
         ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        measurable: np.ndarray = points[self.inside(points, 0.5)]
-        return measurable
+        return points[self.inside(points, 0.5)]
 
     def displacement(
         self, number: int, points_mm: np.ndarray, window_mm: Point | None = None
@@ -183,10 +181,6 @@ def open_truth(folder: str | Path, apart: str | Path | None = None) -> Truth:
         The data set, or its folder `TRUTH`. With `apart` the data set.
     apart : str or Path, optional
         Folder of the truth where the data set does not hold it.
-
-    Returns
-    -------
-    Truth
 
     Raises
     ------

@@ -221,10 +221,6 @@ def load_calibration(path: str | Path) -> Calibration:
     path : str or Path
         The HDF5 file.
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     InputError

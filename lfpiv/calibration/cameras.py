@@ -64,10 +64,6 @@ def calibrate(experiment: Experiment | str | Path, progress: StepProgress | None
     progress : callable, optional
         Called with the finished fraction.
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     InputError
@@ -112,10 +108,6 @@ def thin_lens(experiment: Experiment, angle_error_deg: float = 0.0) -> Calibrati
         From `open_experiment`. Its white images give the microlens arrays.
     angle_error_deg : float
         Error added to the angle of every camera's axis to z [degree], Eqs. 11-12.
-
-    Returns
-    -------
-    Calibration
 
     Raises
     ------

@@ -87,8 +87,7 @@ def liquid_surface(dots: BoardDots, lens: ThinLensModel, optics: Optics) -> Liqu
                 rest = surface(p)(points, pupil) - array
         except ValueError:
             rest = np.full(array.shape, LOST_MM)
-        finite: np.ndarray = np.where(np.isfinite(rest), rest, LOST_MM).ravel()
-        return finite
+        return np.where(np.isfinite(rest), rest, LOST_MM).ravel()
 
     found = robust_minimum(residual_of, np.concatenate([PRIOR, [PRIOR[0], PRIOR[0], TILT, TILT]]))
     residual = median_distance(residual_of(found).reshape(-1, 2)) / optics.microlens_pitch_mm

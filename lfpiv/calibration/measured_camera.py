@@ -173,8 +173,7 @@ def fit_lens(experiment: Experiment, setup: CameraSetup, dots: BoardDots, pitch_
 
 def label_std(dots: BoardDots, pitch_mm: float) -> np.ndarray:
     """Return the standard deviation of the labels [mm], shape (n,), the error that a dot's labels share included."""
-    std: np.ndarray = np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
-    return std
+    return np.hypot(dots.std_mm, MODEL_ERROR_PITCH * pitch_mm)
 
 
 def decode(experiment: Experiment, setup: CameraSetup) -> Sensor:

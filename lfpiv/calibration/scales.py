@@ -125,8 +125,7 @@ def _scales(camera: CameraLabels, magnification: float) -> Scales:
 
     def residual_of(parameters: np.ndarray) -> np.ndarray:
         scaled = points + parameters[-1] * (points[:, 2:] - middle) * along_z
-        residual: np.ndarray = (moved(lens, parameters[:-1])(scaled, pupil) - array).ravel()
-        return residual
+        return (moved(lens, parameters[:-1])(scaled, pupil) - array).ravel()
 
     before, parameters = _scatter(residual_of(np.zeros(prior.size))), robust_minimum(residual_of, prior)
     residual = residual_of(parameters)

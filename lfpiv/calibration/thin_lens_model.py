@@ -97,8 +97,7 @@ class ThinLensModel:
         """Trace rays as a call does, from points in the axes of the camera [mm], shape (n, 3)."""
         magnification = self.image_distance_mm / (self.object_distance_mm - camera[:, 2:])
         gain = self.pupil_scale * (1 - self.image_distance_mm / self.focal_length_mm + magnification)
-        array: np.ndarray = self.array_offset_mm + gain * np.asarray(pupil, float) - magnification * camera[:, :2]
-        return array
+        return self.array_offset_mm + gain * np.asarray(pupil, float) - magnification * camera[:, :2]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the model as named arrays for files and kernels. `from_arrays` is the inverse."""
@@ -172,10 +171,6 @@ def fit_thin_lens(
     std : array_like, shape (n,), optional
         Standard deviation of each label [mm]. Default: equal, estimated from the residual.
 
-    Returns
-    -------
-    ThinLensModel
-
     Raises
     ------
     ValueError
@@ -191,8 +186,7 @@ def fit_thin_lens(
 
     def residual_of(parameters: np.ndarray) -> np.ndarray:
         deviation = moved(start, parameters)(points, pupil) - array
-        residual: np.ndarray = (deviation / std[:, None]).ravel()
-        return residual
+        return (deviation / std[:, None]).ravel()
 
     return moved(start, robust_minimum(residual_of))
 
@@ -304,7 +298,4 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     x, y, z = vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.linalg.norm(vector)
-    rotation: np.ndarray = (
-        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
-    )
-    return rotation
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross

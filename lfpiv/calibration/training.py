@@ -125,10 +125,6 @@ def train(
     unit : float
         Length in which errors are given, for example the microlens pitch [mm].
 
-    Returns
-    -------
-    Training
-
     Raises
     ------
     ValueError
@@ -194,10 +190,6 @@ def split_samples(
         Group of each sample, for example its board dot. A group is never divided between parts.
     rng : numpy.random.Generator
         Source of the random order.
-
-    Returns
-    -------
-    Split
 
     Raises
     ------

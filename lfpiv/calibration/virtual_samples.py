@@ -125,5 +125,4 @@ def _powers(points: np.ndarray, dots: int) -> list[tuple[int, ...]]:
 def _places_between(labelled: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     first, second = rng.integers(len(labelled), size=(2, len(labelled) // 2))
     part = rng.random((len(first), 1))
-    places: np.ndarray = part * labelled[first] + (1 - part) * labelled[second]
-    return places
+    return part * labelled[first] + (1 - part) * labelled[second]

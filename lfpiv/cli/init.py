@@ -46,10 +46,6 @@ def write_experiment(path: Path, given: Mapping[str, str | None]) -> Written:
     given : mapping of str to str or None
         Key of a question -> its answer, None where there is none.
 
-    Returns
-    -------
-    Written
-
     Raises
     ------
     InputError

@@ -69,8 +69,7 @@ class LikelyFlow:
         if simulated:
             for_steady, for_other = self.gains(simulated)
             steady, other = for_steady * steady, for_other * other
-        flow: np.ndarray = self._levels[pair] + field_of(steady + other)
-        return flow
+        return self._levels[pair] + field_of(steady + other)
 
     def gains(self, simulated: Sequence[Simulated]) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of the modes of the mean, and of what differs from it, each of shape (z, y, x, 3)."""
@@ -90,8 +89,7 @@ class LikelyFlow:
         """
         left = np.maximum(power - errors, 0)
         whole = np.maximum(self._sums(power - errors), 0) / np.maximum(self._sums(left), _TINY)
-        gain: np.ndarray = np.sqrt(np.minimum(whole, 1)[self._shells] * left / np.maximum(power, _TINY))
-        return gain
+        return np.sqrt(np.minimum(whole, 1)[self._shells] * left / np.maximum(power, _TINY))
 
     def _slopes_and_errors(self, simulated: Sequence[Simulated]) -> tuple[np.ndarray, np.ndarray]:
         """Return the slope and the power of the errors of a mode of each shell, shape (shell, 3)."""
@@ -116,5 +114,4 @@ _TINY = np.finfo(float).tiny
 
 def _errors(slope: np.ndarray, imposed: np.ndarray, products: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Return the power of what a slope leaves of the modes found, from sums of products of modes."""
-    errors: np.ndarray = np.maximum(found - 2 * slope * products + slope**2 * imposed, 0)
-    return errors
+    return np.maximum(found - 2 * slope * products + slope**2 * imposed, 0)

@@ -43,8 +43,7 @@ class LightField:
         if self._light is None:
             return inside.astype(float)
         places = voxel_place(points_mm, self._grid).T
-        light: np.ndarray = ndimage.map_coordinates(self._light, places, order=1, mode="nearest") * inside
-        return light
+        return ndimage.map_coordinates(self._light, places, order=1, mode="nearest") * inside
 
 
 def _lit(volume: np.ndarray) -> np.ndarray:

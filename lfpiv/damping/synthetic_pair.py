@@ -122,23 +122,20 @@ class RecordedImages:
         They are not numbers where there is no light.
         """
         covariances = self._sub_apertures[name].fluctuations(image).covariances
-        ratios: np.ndarray = covariances / (self._light(name, image) ** 2 or np.nan)
-        return ratios
+        return covariances / (self._light(name, image) ** 2 or np.nan)
 
     def _light(self, name: str, image: np.ndarray) -> float:
         return float(image[self._seen[name]].sum(dtype=np.float64))
 
     def seen(self, name: str) -> np.ndarray:
         """Return the pixels of a camera that see the volume, shape (rows, columns)."""
-        pixels: np.ndarray = self._seen[name]
-        return pixels
+        return self._seen[name]
 
 
 def random_places(grid: Grid, count: float, rng: np.random.Generator) -> np.ndarray:
     """Return random places (x, y, z) [mm] in a grid, shape (round(count), 3)."""
     edges_mm = np.array(grid.shape[::-1]) * grid.voxel_mm
-    places: np.ndarray = grid.centre_mm + rng.uniform(-0.5, 0.5, (round(count), 3)) * edges_mm
-    return places
+    return grid.centre_mm + rng.uniform(-0.5, 0.5, (round(count), 3)) * edges_mm
 
 
 class SyntheticPair:

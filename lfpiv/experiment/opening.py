@@ -46,10 +46,6 @@ def open_experiment(path: str | Path) -> Experiment:
     path : str or Path
         TOML file in the form described in the README.
 
-    Returns
-    -------
-    Experiment
-
     Raises
     ------
     InputError

@@ -123,8 +123,7 @@ class LensLattice:
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
         """Return the lens centres (s, t) of lattice indices (i, j) [mm], shape (..., 2)."""
-        centres: np.ndarray = np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
-        return centres
+        return np.asarray(self.origin_mm) + np.asarray(index, float) @ np.asarray(self.basis_mm)
 
     def nearest(self, position_mm: np.ndarray) -> np.ndarray:
         """Return the lattice index (i, j) of the lens nearest to each position (s, t) [mm], shape (..., 2).

@@ -22,8 +22,7 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
     about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     about_z = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
-    rotation: np.ndarray = about_z @ about_x @ about_y
-    return rotation
+    return about_z @ about_x @ about_y
 
 
 @dataclass(frozen=True)

@@ -167,8 +167,7 @@ def _spline_integral(end: np.ndarray) -> np.ndarray:
     """Return the integral of the cubic B-spline around 0 from minus infinity to `end`."""
     far = np.clip(np.abs(end), 0, 2)
     half = np.where(far < 1, 2 * far / 3 - far**3 / 3 + far**4 / 8, 0.5 - (2 - far) ** 4 / 24)
-    integral: np.ndarray = 0.5 + np.sign(end) * half
-    return integral
+    return 0.5 + np.sign(end) * half
 
 
 def _for_values(matrix: np.ndarray) -> np.ndarray:
@@ -183,13 +182,11 @@ def _for_values(matrix: np.ndarray) -> np.ndarray:
 
 def _place(given: Grid, grid: Grid, axis: int) -> np.ndarray:
     """Return the voxel centres of `grid` along an axis, in voxels of `given` from the centre of its first voxel."""
-    place: np.ndarray = (grid.axis_mm(axis) - given.first_centre_mm[axis]) / given.voxel_mm
-    return place
+    return (grid.axis_mm(axis) - given.first_centre_mm[axis]) / given.voxel_mm
 
 
 def _mirrored(index: np.ndarray, count: int) -> np.ndarray:
     """Mirror indices of voxels about the centres of the first and the last voxel."""
     period = max(2 * (count - 1), 1)
     folded = np.abs(index) % period
-    mirrored: np.ndarray = np.minimum(folded, period - folded) if count > 1 else np.zeros_like(index)
-    return mirrored
+    return np.minimum(folded, period - folded) if count > 1 else np.zeros_like(index)

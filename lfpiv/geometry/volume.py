@@ -125,8 +125,7 @@ def _grid_of(volume: xr.DataArray, name: str) -> Grid:
 
 def voxel_place(points_mm: np.ndarray, grid: Grid) -> np.ndarray:
     """Return points (x, y, z) [mm] as fractional voxel indices (z, y, x)."""
-    place: np.ndarray = (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
-    return place
+    return (points_mm[:, ::-1] - np.asarray(grid.first_centre_mm)) / grid.voxel_mm
 
 
 def lies_in(points_mm: np.ndarray, grid: Grid, margin_voxel: float = 0.0) -> np.ndarray:

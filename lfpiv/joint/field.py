@@ -95,8 +95,7 @@ def _slope(moved: np.ndarray, places: Mapping[str, np.ndarray], along: str) -> n
     lines = moved[np.ix_(*chosen)]
     if moved.shape[axis] == 1:
         return np.zeros_like(lines)
-    slope: np.ndarray = CubicSpline(np.arange(moved.shape[axis]), lines, axis=axis)(places[along], 1)
-    return slope
+    return CubicSpline(np.arange(moved.shape[axis]), lines, axis=axis)(places[along], 1)
 
 
 def _variable(values: np.ndarray, units: str, about: str) -> tuple[tuple[str, ...], np.ndarray, dict[str, str]]:

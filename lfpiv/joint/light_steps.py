@@ -141,6 +141,5 @@ class LightSteps:
 def _partition(normalisation: LensSubsets | RowSubsets, cameras: int) -> Partition:
     """Return the subsets to iterate over: as in the reconstruction, or all rays at once."""
     if normalisation.has_subsets:
-        found: Partition = normalisation.partitions[0]
-        return found
+        return normalisation.partitions[0]
     return Partition((whole_subset(cameras),), normalisation.steps[:1])

@@ -119,8 +119,7 @@ class JointModel:
             ratio = np.log((smooth[1] + dark) / (smooth[0] + dark))
             self.rho = np.clip(ratio / 2, -LARGEST_LOSS, LARGEST_LOSS).astype(np.float32)
         first, second = (np.maximum(part, np.float32(least)) for part in parts)
-        light: np.ndarray = np.sqrt(first * second) * self.lit
-        return light
+        return np.sqrt(first * second) * self.lit
 
 
 def _blurred(blur: GaussianBlur | Sieve, volume: np.ndarray) -> np.ndarray:

@@ -61,8 +61,7 @@ class SplineField:
         edge = last / cells if last else 1.0
         knots = (np.arange(cells + 7) - 3) * edge
         within = np.clip(places, 0, cells * edge * (1 - 1e-12))
-        matrix: np.ndarray = BSpline.design_matrix(within, knots, 3).toarray()
-        return matrix
+        return BSpline.design_matrix(within, knots, 3).toarray()
 
     def values(self, nodes: np.ndarray) -> np.ndarray:
         """Return the displacement of each voxel, shape (3, z, y, x), float32."""
@@ -82,8 +81,7 @@ class SplineField:
         for axis in range(3):
             places = (grid.axis_mm(axis) - own.first_centre_mm[axis]) / own.voxel_mm
             matrices.append(self._matrix(axis, places))
-        found: np.ndarray = (_along_axes(matrices, nodes) * (own.voxel_mm / grid.voxel_mm)).astype(np.float32)
-        return found
+        return (_along_axes(matrices, nodes) * (own.voxel_mm / grid.voxel_mm)).astype(np.float32)
 
     def penalty(self, nodes: np.ndarray, weights: np.ndarray | float = 1.0) -> np.ndarray:
         """Return the gradient of half the sum of the squared second differences along each axis.
@@ -120,8 +118,7 @@ class SplineField:
 
         def normal(nodes: np.ndarray) -> np.ndarray:
             fitted = _along_axes(back, weight * _along_axes(means, nodes))
-            total: np.ndarray = fitted + ROUGH_START * self.penalty(nodes) + SMALL * nodes
-            return total
+            return fitted + ROUGH_START * self.penalty(nodes) + SMALL * nodes
 
         return conjugate_gradients(normal, _along_axes(back, weight * given), steps=STEPS_OF_FIT, least=SMALL**2)
 
@@ -131,8 +128,7 @@ def window_shares(voxels_mm: np.ndarray, centres_mm: np.ndarray, edge_mm: float)
     voxel_mm = (voxels_mm[-1] - voxels_mm[0]) / (len(voxels_mm) - 1) if len(voxels_mm) > 1 else edge_mm
     reach = (edge_mm + voxel_mm) / 2 - np.abs(voxels_mm - np.asarray(centres_mm)[:, None])
     share = np.clip(reach / voxel_mm, 0, 1)
-    mean: np.ndarray = share / share.sum(axis=1, keepdims=True)
-    return mean
+    return share / share.sum(axis=1, keepdims=True)
 
 
 def _along_axes(matrices: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:

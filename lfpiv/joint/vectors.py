@@ -133,8 +133,7 @@ class Evidence:
     def agrees(self, valid: np.ndarray) -> np.ndarray:
         """Return whether nothing is left beyond its typical uncertainty in valid vectors, shape (z, y, x)."""
         typical = np.nanmedian(self.scatter[valid], axis=0) if valid.any() else np.zeros(3)
-        found: np.ndarray = (np.abs(self.left) <= np.minimum(CONTRADICTION * typical, FARTHEST_VOXEL)).all(-1)
-        return found
+        return (np.abs(self.left) <= np.minimum(CONTRADICTION * typical, FARTHEST_VOXEL)).all(-1)
 
 
 def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequence[xr.DataArray]) -> Evidence:

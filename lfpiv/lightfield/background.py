@@ -216,8 +216,7 @@ class _Minimum:
     def bias(self, decoder: LightFieldDecoder) -> np.ndarray:
         """Return by how much noise lowers the minimum of each pixel [counts]; photon noise grows with the light."""
         sigma = np.sqrt(self.noise**2 + decoder.counts_per_photon * np.maximum(self.smallest, 0))
-        bias: np.ndarray = (-least_of_normal(self.count) * sigma).astype(np.float32)
-        return bias
+        return (-least_of_normal(self.count) * sigma).astype(np.float32)
 
 
 def _pool(first: Series, second: Series) -> tuple[_Minimum | None, float]:
@@ -280,8 +279,7 @@ def _stray(series: Series, decoder: LightFieldDecoder) -> np.ndarray:
         return np.zeros(shape, np.float32)
     at = np.meshgrid(*((np.arange(n) + 0.5) / n * m - 0.5 for n, m in zip(shape, cells, strict=True)), indexing="ij")
     smooth = ndimage.map_coordinates(values, at, order=1, mode="nearest")
-    light: np.ndarray = (np.maximum(smooth, 0) * decoder.gain * np.minimum(decoder.coverage, 1)).astype(np.float32)
-    return light
+    return (np.maximum(smooth, 0) * decoder.gain * np.minimum(decoder.coverage, 1)).astype(np.float32)
 
 
 def _unusable(first: Series, second: Series | None) -> np.ndarray:
@@ -305,8 +303,7 @@ def _unusable(first: Series, second: Series | None) -> np.ndarray:
         same = max(same, 0.5)
     if same >= 1 or same ** (images - 1) * low.size > _STUCK_PIXELS:
         stuck &= low > CLEAR_SIGMA * first.noise
-    unusable: np.ndarray = often | stuck
-    return unusable
+    return often | stuck
 
 
 def _cut_off(smallest: np.ndarray) -> np.ndarray:
@@ -314,8 +311,7 @@ def _cut_off(smallest: np.ndarray) -> np.ndarray:
 
     Levels of the images differ by less than a count. Where the camera has an offset, hardly a pixel is among them.
     """
-    cut_off: np.ndarray = smallest < smallest.min() + 1
-    return cut_off
+    return smallest < smallest.min() + 1
 
 
 def _extended(often: np.ndarray, series: Series) -> np.ndarray:
@@ -325,8 +321,7 @@ def _extended(often: np.ndarray, series: Series) -> np.ndarray:
     pitch = series.decoder.optics.microimage_pitch_px
     areas, count = ndimage.label(ndimage.maximum_filter(often, 2 * int(pitch / 2) + 1))
     sizes, around = np.bincount(areas[often], minlength=count + 1), np.bincount(areas.ravel(), minlength=count + 1)
-    large: np.ndarray = often & ((sizes > _MANY_MICROIMAGES * pitch**2) & (sizes > _FILLED * around))[areas]
-    return large
+    return often & ((sizes > _MANY_MICROIMAGES * pitch**2) & (sizes > _FILLED * around))[areas]
 
 
 def _spread(pixels: np.ndarray, series: Series) -> float:

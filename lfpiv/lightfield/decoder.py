@@ -86,10 +86,6 @@ class LightFieldDecoder:
         dark : ndarray, shape (rows, columns), optional
             Image with the lens capped [counts]. Default: the gaps between the microimages give the dark level.
 
-        Returns
-        -------
-        LightFieldDecoder
-
         Raises
         ------
         InputError
@@ -149,8 +145,7 @@ class LightFieldDecoder:
         -------
         ndarray, shape (rows, columns), float32
         """
-        gain: np.ndarray = self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
-        return gain
+        return self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
 
     def sub_aperture(
         self, image: np.ndarray, pupil_mm: tuple[float, float], *, level: float | None = None
@@ -253,8 +248,7 @@ def _assign_lenses(optics: Optics, lattice: LensLattice) -> tuple[np.ndarray, np
 def _neighbours(lattice: LensLattice) -> np.ndarray:
     """Return the vectors from a lens to its neighbours [mm], shape (n, 2)."""
     vectors = NEIGHBOURS @ np.asarray(lattice.basis_mm)
-    near: np.ndarray = vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # no far corners
-    return near
+    return vectors[np.hypot(*vectors.T) < 1.6 * lattice.pitch_mm]  # no far corners
 
 
 def _cover(optics: Optics, lattice: LensLattice, offset_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -298,8 +292,7 @@ def disc_fraction(offset: np.ndarray, radius: float) -> tuple[np.ndarray, np.nda
     half_sum, half_gap = (normal[:, 0] + normal[:, 1]) / 2, (normal[:, 0] - normal[:, 1]) / 2
 
     def ramp(x: np.ndarray) -> np.ndarray:
-        square: np.ndarray = np.maximum(x, 0) ** 2
-        return square
+        return np.maximum(x, 0) ** 2
 
     share = ramp(reach + half_sum) - ramp(reach + half_gap) - ramp(reach - half_gap) + ramp(reach - half_sum)
     fraction[edge] = np.clip(share / (2 * normal[:, 0] * normal[:, 1]), 0, 1)

@@ -264,8 +264,7 @@ def _places(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the places of pixels, relative to the sensor's centre, over its half diagonal, shape (2, pixels)."""
     rows, columns = np.divmod(pixels, shape[1])
     middle = (np.array([[shape[1]], [shape[0]]]) - 1) / 2
-    places: np.ndarray = (np.stack([columns, rows]) - middle) / (np.hypot(shape[0], shape[1]) / 2)
-    return places
+    return (np.stack([columns, rows]) - middle) / (np.hypot(shape[0], shape[1]) / 2)
 
 
 def _fold(light: np.ndarray, folding: _Folding) -> tuple[Cells, np.ndarray]:
@@ -299,8 +298,7 @@ def _correlate(image: np.ndarray, white: np.ndarray, pixels: np.ndarray) -> np.n
     folds = [part.sum(axis=0) / count for part in (image, white)]
     first, second = (fold - fold.mean() for fold in folds)
     power = float((first**2).sum() * (second**2).sum()) ** 0.5
-    product: np.ndarray = np.fft.ifft2(np.fft.fft2(first) * np.fft.fft2(second).conj()).real / max(power, 1e-30)
-    return product
+    return np.fft.ifft2(np.fft.fft2(first) * np.fft.fft2(second).conj()).real / max(power, 1e-30)
 
 
 def _highest(correlation: np.ndarray) -> tuple[np.ndarray, float]:

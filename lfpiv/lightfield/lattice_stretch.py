@@ -127,20 +127,17 @@ class _Half:
         start, turn, widen = np.unravel_index(int(alike.argmax()), alike.shape)
         place = np.array([_EDGES[turn], _EDGES[widen], *starts[start]])
         fit = optimize.minimize(lambda place: -self.likeness(place), place, method="BFGS")
-        found: np.ndarray = fit.x
-        return found
+        return fit.x
 
 
 def _harmonics() -> np.ndarray:
     """Return the orders of the harmonics of a cell, one of each conjugate pair, shape (harmonics, 2)."""
     order = np.arange(-_HARMONICS, _HARMONICS + 1)
     rows, columns = (part.ravel() for part in np.meshgrid(order, order, indexing="ij"))
-    chosen: np.ndarray = np.stack([rows, columns], axis=-1)[(rows > 0) | ((rows == 0) & (columns > 0))]
-    return chosen
+    return np.stack([rows, columns], axis=-1)[(rows > 0) | ((rows == 0) & (columns > 0))]
 
 
 def _spectra(part: np.ndarray, pixels: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Return harmonics of each tile's fold about its mean level, shape (tile, harmonics)."""
     level = part.sum(axis=(1, 2), keepdims=True) / np.maximum(pixels.sum(axis=(1, 2), keepdims=True), 1)
-    spectra: np.ndarray = np.fft.fft2(part - level * pixels)[:, order[:, 0], order[:, 1]]
-    return spectra
+    return np.fft.fft2(part - level * pixels)[:, order[:, 0], order[:, 1]]

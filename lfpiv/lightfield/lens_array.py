@@ -135,10 +135,6 @@ def find_lens_array(
     layout : {"square", "hexagonal"}
         Arrangement of the lenses. A hexagonal array may have any orientation.
 
-    Returns
-    -------
-    LensArray
-
     Raises
     ------
     InputError
@@ -245,8 +241,7 @@ class _Lattice:
     """Lattice vectors, rows (column, row) [pixel]."""
 
     def nodes(self, index: np.ndarray) -> np.ndarray:
-        centres: np.ndarray = self.origin + index @ self.basis
-        return centres
+        return self.origin + index @ self.basis
 
 
 def _fit_lattice(image: np.ndarray, start: _Lattice, layout: str) -> tuple[_Lattice, float, int]:

@@ -126,8 +126,7 @@ def _overlap_sums(tile: np.ndarray, reach: tuple[int, int]) -> tuple[np.ndarray,
     left, right = np.maximum(-c, 0), columns - np.maximum(c, 0)  # columns with a partner at column + c
 
     def box(top: np.ndarray, bottom: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-        inside: np.ndarray = total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
-        return inside
+        return total[bottom, last] - total[top, last] - total[bottom, first] + total[top, first]
 
     return box(0 * r, rows - r, left, right), box(r, rows + 0 * r, left + c, right + c)
 
@@ -184,8 +183,7 @@ def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
     turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
     angle = math.degrees(math.atan2(lag[1], lag[0]))
     angles = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
-    basis: np.ndarray = np.hypot(*lag) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return basis
+    return np.hypot(*lag) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _refine_basis(correlation: np.ndarray, basis: np.ndarray, lobe: float) -> np.ndarray:
@@ -224,8 +222,7 @@ def indices_inside(origin: np.ndarray, basis: np.ndarray, low: ArrayLike, high: 
     j, i = (a.ravel() for a in np.mgrid[first[1] : last[1] + 1, first[0] : last[0] + 1])
     index: np.ndarray = np.stack([i, j], axis=1)
     node = origin + index @ basis
-    inside: np.ndarray = index[((node >= low) & (node < high)).all(1)]
-    return inside
+    return index[((node >= low) & (node < high)).all(1)]
 
 
 def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
@@ -263,8 +260,7 @@ def find_phase(image: np.ndarray, basis: np.ndarray, layout: str) -> np.ndarray:
             )
         centre = centres[int(np.argmin(found))]
     start = [max(0, (n - TILE_PX) // 2) for n in image.shape[::-1]]
-    phase: np.ndarray = centre / bins @ basis + start
-    return phase
+    return centre / bins @ basis + start
 
 
 def _unexplained(cell: np.ndarray, basis: np.ndarray) -> float:

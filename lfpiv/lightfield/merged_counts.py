@@ -71,8 +71,7 @@ class _Window:
         self.unevenness = float(self.rest @ self.rest) / (width - self._away.shape[1])
 
     def _without_course(self, values: np.ndarray) -> np.ndarray:
-        without: np.ndarray = values - (values @ self._away) @ self._away.T
-        return without
+        return values - (values @ self._away) @ self._away.T
 
     def fits(self, merged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return correlation and factor of numbers of merged counts (n, width) with the pixels."""
@@ -134,8 +133,7 @@ def _merged(cubics: np.ndarray, width: int) -> np.ndarray:
     edge = np.arange(width + 1) - width / 2
     powers = np.stack([np.ones_like(edge), edge, edge**2 / 2, edge**3 / 6])
     reached = (cubics.T @ powers).astype(np.float32) % 1
-    merged: np.ndarray = reached[:, :-1] - reached[:, 1:]
-    return merged
+    return reached[:, :-1] - reached[:, 1:]
 
 
 @functools.cache
@@ -150,8 +148,7 @@ def _steps(free: int) -> np.ndarray:
     """Return the first steps of a cubic, of which the first `free` coefficients vary, shape (4, n)."""
     units = np.linspace(-1, 1, 5)
     varied = np.meshgrid(*[units] * free, *[[0.0]] * (4 - free), indexing="ij")
-    steps: np.ndarray = _STEP[:, None] * np.stack(varied).reshape(4, -1)
-    return steps
+    return _STEP[:, None] * np.stack(varied).reshape(4, -1)
 
 
 def _grid(*axes: ArrayLike) -> np.ndarray:

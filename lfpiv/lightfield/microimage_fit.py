@@ -186,8 +186,7 @@ def _normalised(patches: np.ndarray, window: np.ndarray) -> tuple[np.ndarray, np
 def _symmetric_median(patches: np.ndarray, brightness: np.ndarray) -> np.ndarray:
     bright = np.flatnonzero(brightness >= TEMPLATE_BRIGHTNESS)
     median = np.median(patches[bright[:: math.ceil(len(bright) / TEMPLATE_LENSES)]], axis=0)
-    symmetric: np.ndarray = (median + median[::-1, ::-1]) / 2
-    return symmetric
+    return (median + median[::-1, ::-1]) / 2
 
 
 def _brightness_gradient(centres: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -214,8 +213,7 @@ def _smooth_slopes(moments: np.ndarray, normal: np.ndarray, field: np.ndarray, g
     smooth = field @ coefficients
     noise = ((slopes - smooth)[inliers] ** 2).mean() * field.shape[1] / len(field)
     signal = (gradient**2).mean()
-    shrunk: np.ndarray = smooth * (signal / max(signal + noise, 1e-30))
-    return shrunk
+    return smooth * (signal / max(signal + noise, 1e-30))
 
 
 def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:
@@ -227,8 +225,7 @@ def _neighbours_light(microimage: np.ndarray, column: np.ndarray, row: np.ndarra
     light = np.where(core, 0, np.maximum(microimage - microimage[core].max(), 0))
     offsets = NEIGHBOURS @ basis
     distance = (column - offsets[:, 0, None, None]) ** 2 + (row - offsets[:, 1, None, None]) ** 2
-    weighted: np.ndarray = light * offsets[distance.argmin(0)].transpose(2, 0, 1)
-    return weighted
+    return light * offsets[distance.argmin(0)].transpose(2, 0, 1)
 
 
 def _cell_window(column: np.ndarray, row: np.ndarray, basis: np.ndarray) -> np.ndarray:

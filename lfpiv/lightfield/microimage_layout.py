@@ -61,10 +61,9 @@ def microimages_of(optics: Optics, lattice: LensLattice) -> Microimages:
     """
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
     first, centre = microimage_centres(optics, lattice, radius + 1)
-    rays: Microimages = microimages.lens_rays(
+    return microimages.lens_rays(
         (int(first[0]), int(first[1])), centre, radius, microimage_edge(optics), optics.sensor_shape
     )
-    return rays
 
 
 def whole_microimages(optics: Optics, lattice: LensLattice) -> Microimages:

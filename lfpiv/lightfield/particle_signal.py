@@ -76,8 +76,7 @@ def _clipped(values: np.ndarray, core: np.ndarray, clip: float) -> np.ndarray:
     """Clip values to `clip` robust standard deviations about the median. Hot pixels lose their weight."""
     median = float(np.median(values[core]))
     reach = clip * max(NORMAL_MAD * float(np.median(np.abs(values[core] - median))), _LEAST_DEVIATION)
-    clipped: np.ndarray = np.clip(values, median - reach, median + reach)
-    return clipped
+    return np.clip(values, median - reach, median + reach)
 
 
 def _correlation(values: np.ndarray, core: np.ndarray, lens: np.ndarray, down: int, aside: int) -> float:

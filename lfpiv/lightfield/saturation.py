@@ -64,8 +64,7 @@ def saturated_share(image: np.ndarray, white_level: float | None = None, *, pile
 
 def saturated_pixels(image: np.ndarray, white_level: float | None = None) -> np.ndarray:
     """Return the saturated pixels, bool. Parameters as for `saturation_level`."""
-    clipped: np.ndarray = image >= saturation_level(image, white_level)
-    return clipped
+    return image >= saturation_level(image, white_level)
 
 
 def _pile(image: np.ndarray, width: float) -> float:

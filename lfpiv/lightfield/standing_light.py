@@ -47,8 +47,7 @@ class StandingLight:
     @property
     def pixels(self) -> np.ndarray:
         """Pixels with light that stands, or unusable ones: no particle alone saturates them, bool."""
-        either: np.ndarray = self.region | self.unusable
-        return either
+        return self.region | self.unusable
 
     @property
     def figures(self) -> dict[str, object]:

@@ -54,10 +54,6 @@ def linear_response(
     least_deviation : float
         Standard deviation of `true` below which the slope is NaN.
 
-    Returns
-    -------
-    LinearResponse
-
     Examples
     --------
     >>> true = np.array([-1.0, 0.0, 1.0])
@@ -168,10 +164,6 @@ def error_curve(length: np.ndarray, size: np.ndarray, total: float) -> ErrorCurv
         Size of the region that each vector stands for, >= 0; vectors of size 0 are left out.
     total : float
         Size of the whole volume, > 0.
-
-    Returns
-    -------
-    ErrorCurve
     """
     length, size = _numbers(length, "length"), _weights(size, len(length))
     if not (np.isfinite(total) and total > 0):

@@ -42,10 +42,6 @@ def reconstruction_quality(
         Subtract the mean of each volume first, which gives the correlation coefficient, -1 to 1. A uniform haze does
         not raise it. The paper does not subtract the mean. For sparse particles the two nearly agree.
 
-    Returns
-    -------
-    float
-
     Raises
     ------
     ValueError
@@ -187,10 +183,6 @@ def dot_error(positions_mm: np.ndarray, spacing_mm: float, planes_mm: Sequence[f
         True distance of adjacent dots [mm].
     planes_mm : sequence of float
         True z of each plane [mm].
-
-    Returns
-    -------
-    DotError
 
     Raises
     ------

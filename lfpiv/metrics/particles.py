@@ -165,10 +165,6 @@ def find_particles(volume: xr.DataArray | np.ndarray, threshold: float, *, grid:
     grid : Grid, optional
         Voxels of an ndarray.
 
-    Returns
-    -------
-    Particles
-
     Raises
     ------
     ValueError
@@ -300,10 +296,6 @@ def particle_quality(
         brightest of the 27 voxels around each.
     radius_voxel : float
         Largest distance of a matched pair [voxel], > 0.
-
-    Returns
-    -------
-    ParticleQuality
 
     Raises
     ------

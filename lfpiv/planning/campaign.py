@@ -87,10 +87,6 @@ def plan(
     progress : callable, optional
         Called as ``progress(step, fraction)``.
 
-    Returns
-    -------
-    Plan
-
     Raises
     ------
     InputError

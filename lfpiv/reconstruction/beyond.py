@@ -151,8 +151,7 @@ def _null(
 
     def draw(count: int) -> np.ndarray:
         size = volume.voxel_mm * np.array(volume.shape[::-1])
-        points: np.ndarray = volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * size
-        return points
+        return volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * size
 
     def contrast(images: Sequence[Sequence[np.ndarray]]) -> float:
         found = [view.contrast(one) for view, each in zip(views, images, strict=True) for one in each]
@@ -247,8 +246,7 @@ class _View:
         """Return the smoothed sub-aperture images of a raw image, shape (pupil point, row, column)."""
         light = ndimage.uniform_filter(np.asarray(image, np.float32), BLUR_PX).reshape(-1)[self._pixels]
         light = np.divide(light, self._response, out=np.zeros_like(light), where=self._response > 0)
-        smoothed: np.ndarray = self._smooth(light) / np.maximum(self._weight, 1e-3)
-        return smoothed
+        return self._smooth(light) / np.maximum(self._weight, 1e-3)
 
     def light_of(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the smoothed sub-aperture images of points of equal brightness, shape (pupil point, row, column)."""
@@ -262,8 +260,7 @@ class _View:
                 at = low + [[i], [j]]
                 inside = np.all((at >= 0) & (at < np.array(light.shape[1:])[:, None]), axis=0)
                 np.add.at(light[number], tuple(at[:, inside]), share[inside])
-        smoothed: np.ndarray = self._smooth(light * (self._response > 0)) / np.maximum(self._weight, 1e-3)
-        return smoothed
+        return self._smooth(light * (self._response > 0)) / np.maximum(self._weight, 1e-3)
 
     def contrast(self, light: np.ndarray) -> float:
         """Return the variance of the grains of sub-aperture images over their squared mean, 1 / n for n particles."""
@@ -275,8 +272,7 @@ class _View:
         """Return the fluctuation of the mean logarithm of the light at the cells, shape (z, y, x)."""
         logarithm = np.log(np.maximum(light / max(float(light.mean()), 1e-9), 0.0) + DARK)
         mean = sum(self._at_cells(one, number) for number, one in enumerate(logarithm)) / len(logarithm)
-        fluctuation: np.ndarray = ndimage.gaussian_filter(mean, FINE) - ndimage.gaussian_filter(mean, WIDE)
-        return fluctuation
+        return ndimage.gaussian_filter(mean, FINE) - ndimage.gaussian_filter(mean, WIDE)
 
     def _places_of(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the places of points in the sub-aperture images, shape (pupil point, 2, point) [lens]."""
@@ -287,8 +283,7 @@ class _View:
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         size = (0.0, self._blur_lenses, self._blur_lenses)
-        smooth: np.ndarray = ndimage.gaussian_filter(values.astype(np.float32), size, mode="constant")
-        return smooth
+        return ndimage.gaussian_filter(values.astype(np.float32), size, mode="constant")
 
     def _at_cells(self, values: np.ndarray, number: int) -> np.ndarray:
         sampled: np.ndarray = ndimage.map_coordinates(values, self._places[number], order=1, cval=0.0, prefilter=False)

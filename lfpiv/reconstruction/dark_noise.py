@@ -42,8 +42,7 @@ def light_cut_off(image: np.ndarray) -> float:
 def _with_dark_neighbours(image: np.ndarray) -> np.ndarray:
     """Return the counts of the pixels whose neighbours in rows and columns are all dark."""
     dark = image <= 0
-    counts: np.ndarray = image[1:-1, 1:-1][dark[:-2, 1:-1] & dark[2:, 1:-1] & dark[1:-1, :-2] & dark[1:-1, 2:]]
-    return counts
+    return image[1:-1, 1:-1][dark[:-2, 1:-1] & dark[2:, 1:-1] & dark[1:-1, :-2] & dark[1:-1, 2:]]
 
 
 def _positive(counts: np.ndarray) -> np.ndarray:

@@ -181,8 +181,7 @@ def _shared(weights: Weights, name: str, shared: np.ndarray) -> np.ndarray:
     if key not in derived:
         _, pixels = _dead_and_lit(weights, name)
         derived[key] = np.flatnonzero(shared[pixels])
-    indices: np.ndarray = derived[key]
-    return indices
+    return derived[key]
 
 
 def _median_and_peak(counts: np.ndarray) -> tuple[float, float]:

@@ -196,8 +196,7 @@ class LensSubsets(Normalisation):
         derived, key = self._weights.derived, ("sums of a set", name, ray_set)
         if key not in derived:
             derived[key] = self._weights.sums_of_set(name, ray_set)
-        sums: np.ndarray = derived[key]
-        return sums
+        return derived[key]
 
 
 class RowSubsets(Normalisation):

@@ -113,16 +113,14 @@ class Fluctuations:
     @cached_property
     def _products(self) -> np.ndarray:
         """Sums of products at the same lens, mean of both neighbours, shape (sub-aperture,)."""
-        products: np.ndarray = (self.here * (self.right + self.below)).sum((1, 2)) / 2
-        return products
+        return (self.here * (self.right + self.below)).sum((1, 2)) / 2
 
     def _apart(self, lenses: int) -> np.ndarray:
         """Return the sums of products some lenses apart, mean of both directions, shape (sub-aperture,)."""
         here, right, below = self.here, self.right, self.below
         along_i = here[..., :-lenses] * below[..., lenses:] + here[..., lenses:] * below[..., :-lenses]
         along_j = here[:, :-lenses] * right[:, lenses:] + here[:, lenses:] * right[:, :-lenses]
-        apart: np.ndarray = (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
-        return apart
+        return (along_i.sum((1, 2)) + along_j.sum((1, 2))) / 2
 
 
 class SubApertures:
@@ -168,8 +166,7 @@ class SubApertures:
         """
         mean = _local_mean(light)
         slow = np.divide(mean, unit, out=np.zeros_like(mean), where=self._lit & (unit > 0))
-        fluctuation: np.ndarray = light - slow * even
-        return fluctuation
+        return light - slow * even
 
 
 def _local_mean(light: np.ndarray) -> np.ndarray:

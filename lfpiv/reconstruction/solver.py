@@ -170,8 +170,7 @@ class SmartSolver:
         derived, key = self.weights.derived, ("particle sizer", self.weights.volume)
         if key not in derived:
             derived[key] = ParticleSizer(self.weights)
-        sizer: ParticleSizer = derived[key]
-        return sizer
+        return derived[key]
 
     @cached_property
     def _views(self) -> np.ndarray | None:

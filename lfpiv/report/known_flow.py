@@ -50,8 +50,7 @@ class Comparison:
     def _errors(self) -> np.ndarray:
         """Return measured minus true displacement of all inner vectors [voxel], shape (3, vector)."""
         measured = np.stack([self.vectors[f"displacement_{axis}"].values for axis in "xyz"])
-        errors: np.ndarray = (measured - self.true_voxel)[(slice(None), *self._inner)].reshape(3, -1)
-        return errors
+        return (measured - self.true_voxel)[(slice(None), *self._inner)].reshape(3, -1)
 
     @property
     def error_voxel(self) -> np.ndarray:

@@ -50,8 +50,7 @@ def section(figures: TrackFigures | None, folder: Path) -> str:
 def _drawn(valid: xr.Dataset) -> np.ndarray:
     """Return the tracks of the picture, an even choice."""
     every = np.unique(valid["track"].values)
-    chosen: np.ndarray = every[np.unique(np.linspace(0, len(every) - 1, MOST_DRAWN).round().astype(int))]
-    return chosen
+    return every[np.unique(np.linspace(0, len(every) - 1, MOST_DRAWN).round().astype(int))]
 
 
 def _panel(shown: xr.Dataset, side: str, speed: np.ndarray, unit: str) -> str:

@@ -113,8 +113,7 @@ def compute(rig: Rig, sizes: Sizes, work: Path, *, seed: int, progress: Progress
     def fitted(file: str, name: str, estimator: str, recipe: Recipe) -> Fit:
         settings = {"seed": seed, "samples": recipe.samples, "epochs": recipe.epochs}
         path = work / "networks" / f"{file}_{name}.json"
-        found: Fit = store.cached(path, settings, lambda: fit(rig, name, estimators[estimator](name), recipe))
-        return found
+        return store.cached(path, settings, lambda: fit(rig, name, estimators[estimator](name), recipe))
 
     jobs = [(trainer, layers, name) for layers in sizes.layers for trainer in TRAINERS for name in cameras]
     cost = np.cumsum([layers**2 * (0.1 if trainer == "GDM" else 1) for trainer, layers, _ in jobs])

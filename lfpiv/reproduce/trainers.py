@@ -158,8 +158,7 @@ def _factor(matrix: np.ndarray, shift: float) -> tuple[np.ndarray, bool] | None:
 
 
 def _residual(outputs: np.ndarray, samples: Samples) -> np.ndarray:
-    residual: np.ndarray = samples.weights * (samples.outputs - outputs)
-    return residual
+    return samples.weights * (samples.outputs - outputs)
 
 
 def _sum_of_squares(layers: Sequence[np.ndarray], samples: Samples) -> float:

@@ -100,8 +100,7 @@ def _verified(path: Path) -> xr.Dataset:
             _require_form(file.attrs, path)
         store_seal.verify_netcdf(path)
         results = xr.open_dataset(path, engine="h5netcdf", chunks=chunks)
-    held: xr.Dataset = results.assign_coords({name: values.compute() for name, values in results.coords.items()})
-    return held
+    return results.assign_coords({name: values.compute() for name, values in results.coords.items()})
 
 
 def _require_form(attributes: Mapping[str, Any], path: Path) -> None:

@@ -56,10 +56,6 @@ def true_board(errors: BoardErrors, nominal_mm: np.ndarray, cameras: int, rng: n
         Number of cameras.
     rng : Generator
         Generator. Each key draws the same whatever the other keys are.
-
-    Returns
-    -------
-    BoardTruth
     """
     planes, dots = nominal_mm.shape[:2]
     scatter = errors.dot_sd_mm * rng.standard_normal((dots, 2))

@@ -72,8 +72,7 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     optics, points_mm = camera.optics, np.asarray(points_mm, float)
     if not camera.window and camera.aberrations is None and camera.lens is None:
         distance = optics.object_distance_mm - camera.local_mm(points_mm)[:, 2]
-        scale: np.ndarray = abs(camera.rotation[2, 2]) * (optics.image_distance_mm / distance) ** 2
-        return scale
+        return abs(camera.rotation[2, 2]) * (optics.image_distance_mm / distance) ** 2
     ring, angle = np.meshgrid(np.sqrt((np.arange(4) + 0.5) / 4), 2 * np.pi * np.arange(8) / 8)
     pupil = optics.pupil_radius_mm * np.stack([ring * np.cos(angle), ring * np.sin(angle)], -1).reshape(-1, 2)
     mapping, step = true_mapping(camera), AREA_STEP_MM * np.eye(3)[:2]
@@ -81,8 +80,7 @@ def image_area(camera: SceneCamera, points_mm: np.ndarray) -> np.ndarray:
     along_x, along_y = ((mapping(at + h, pupil) - mapping(at - h, pupil)) / (2 * AREA_STEP_MM) for h in step)
     area: np.ndarray = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
     reached = np.isfinite(area).reshape(len(points_mm), -1).sum(axis=1)
-    mean: np.ndarray = np.nan_to_num(area).reshape(len(points_mm), -1).sum(axis=1) / np.maximum(reached, 1)
-    return mean
+    return np.nan_to_num(area).reshape(len(points_mm), -1).sum(axis=1) / np.maximum(reached, 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -341,8 +341,7 @@ def window_mean(
     centres_mm, window = checked_points(centres_mm), _window(window_mm)
     if isinstance(flow, TurbulentFlow):
         turbulent = flow.fluctuation.window_mean(centres_mm, tuple(window))
-        mean: np.ndarray = window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
-        return mean
+        return window_mean(flow.mean, centres_mm, tuple(window), order=order) + turbulent
     node, weight = np.polynomial.legendre.leggauss(order)
     nodes = np.stack(np.meshgrid(node, node, node, indexing="ij"), -1).reshape(-1, 3) * window / 2
     weights = np.einsum("i,j,k->ijk", weight, weight, weight).ravel() / 8

@@ -238,8 +238,7 @@ class LensSystem:
         terms = real_optics.lens_terms(h, p)
         design = np.concatenate([np.hstack([terms * h[:, [k]], terms * p[:, [k]]]) for k in (0, 1)])
         found = np.linalg.lstsq(design, np.concatenate([offset[..., 0], offset[..., 1]]), rcond=None)[0]
-        packed: np.ndarray = found.reshape(2, terms.shape[1], 2).transpose(1, 2, 0).reshape(terms.shape[1], 4)
-        return packed
+        return found.reshape(2, terms.shape[1], 2).transpose(1, 2, 0).reshape(terms.shape[1], 4)
 
 
 @functools.lru_cache(maxsize=64)

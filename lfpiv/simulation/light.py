@@ -37,20 +37,17 @@ class Brightness(Table):
 
     def diameters(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw diameters relative to the median, shape (count,)."""
-        diameter: np.ndarray = np.exp(self.size_log_sd * rng.standard_normal(count))
-        return diameter
+        return np.exp(self.size_log_sd * rng.standard_normal(count))
 
     def of_diameters(self, diameter: np.ndarray) -> np.ndarray:
         """Return the brightness of particles of given relative diameters, of mean 1 over the distribution."""
         spread = self.size_exponent * self.size_log_sd
-        brightness: np.ndarray = diameter**self.size_exponent * np.exp(-(spread**2) / 2)
-        return brightness
+        return diameter**self.size_exponent * np.exp(-(spread**2) / 2)
 
     def of_cameras(self, cameras: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the particles' brightness in each camera, of mean 1, shape (cameras, count)."""
         drawn = self.camera_log_sd * rng.standard_normal((cameras, count))
-        factor: np.ndarray = np.exp(drawn - self.camera_log_sd**2 / 2)
-        return factor
+        return np.exp(drawn - self.camera_log_sd**2 / 2)
 
 
 class Sheet(Table):
@@ -85,8 +82,7 @@ class Sheet(Table):
     def distance_mm(self, points_mm: np.ndarray, pulse: int) -> np.ndarray:
         """Return the signed distance of points (n, 3) from the middle of a pulse's sheet, shape (n,) [mm]."""
         direction = np.asarray(self.direction, float) / np.linalg.norm(self.direction)
-        distance: np.ndarray = np.asarray(points_mm, float) @ direction - _of_pulse(self.position_mm, pulse)
-        return distance
+        return np.asarray(points_mm, float) @ direction - _of_pulse(self.position_mm, pulse)
 
     def light(self, points_mm: np.ndarray, pulse: int) -> np.ndarray:
         """Return the light of a pulse at points, relative to its middle.
@@ -119,8 +115,7 @@ class Sheet(Table):
 
     def powers(self, rng: np.random.Generator) -> np.ndarray:
         """Draw the power of both pulses of one pair, shape (2,)."""
-        power: np.ndarray = np.clip(np.asarray(self.power) * (1 + self.power_sd * rng.standard_normal(2)), 0, None)
-        return power
+        return np.clip(np.asarray(self.power) * (1 + self.power_sd * rng.standard_normal(2)), 0, None)
 
 
 def _of_pulse(value: float | tuple[float, float], pulse: int) -> float:

@@ -58,10 +58,6 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     pair : int
         Number of the pair, from 0. Each pair has its own particles.
 
-    Returns
-    -------
-    PlacedParticles
-
     Raises
     ------
     InputError

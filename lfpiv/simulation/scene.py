@@ -302,10 +302,6 @@ def open_scene(path: str | Path) -> Scene:
     path : str or Path
         TOML file with the tables of `Scene`. The path of a tracer file is relative to it.
 
-    Returns
-    -------
-    Scene
-
     Raises
     ------
     InputError
@@ -333,10 +329,6 @@ def stored_scene(folder: str | Path) -> Scene:
     ----------
     folder : str or Path
         The folder ``truth``. The path of a tracer file is relative to it.
-
-    Returns
-    -------
-    Scene
 
     Raises
     ------

@@ -273,8 +273,7 @@ class SceneCamera(NominalCamera):
 
     def local_mm(self, points_mm: np.ndarray) -> np.ndarray:
         """Return points (n, 3) in the camera's frame, shape (n, 3) [mm]."""
-        local: np.ndarray = (points_mm - self.axis_point_mm) @ self.rotation.T
-        return local
+        return (points_mm - self.axis_point_mm) @ self.rotation.T
 
     def _plates(self, axis_point_mm: np.ndarray) -> np.ndarray:
         windows = self.window or ()

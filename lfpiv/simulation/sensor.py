@@ -97,10 +97,6 @@ def draw_pattern(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generato
         Rows and columns.
     rng : Generator
         Generator. Each table key draws the same whatever the other keys are.
-
-    Returns
-    -------
-    SensorPattern
     """
     gain = np.maximum(0, 1 + sensor.gain_sd * rng.standard_normal(shape))
     offset = np.broadcast_to(sensor.column_sd_counts * rng.standard_normal(shape[1]), shape)

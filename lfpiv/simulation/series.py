@@ -127,8 +127,7 @@ def _instant(scene: Scene, number: int, states: list[_State], traits: _Traits) -
 
 def _inside(scene: Scene, position_mm: np.ndarray) -> np.ndarray:
     """Return which points (n, 3) are in the seeded region, shape (n,)."""
-    inside: np.ndarray = np.all(np.abs(position_mm - scene.volume.centre_mm) <= seeded_size_mm(scene) / 2, axis=1)
-    return inside
+    return np.all(np.abs(position_mm - scene.volume.centre_mm) <= seeded_size_mm(scene) / 2, axis=1)
 
 
 def _given(scene: Scene) -> tuple[list[_State], _Traits]:
@@ -182,8 +181,7 @@ def _draw_traits(scene: Scene, count: int, instant: int) -> _Traits:
 def _drawn(scene: Scene, count: int, instant: int) -> np.ndarray:
     """Draw points in the seeded region, shape (count, 3) [mm]."""
     rng = np.random.default_rng([scene.seed, 31, instant])
-    drawn: np.ndarray = scene.volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * seeded_size_mm(scene)
-    return drawn
+    return scene.volume.centre_mm + rng.uniform(-0.5, 0.5, (count, 3)) * seeded_size_mm(scene)
 
 
 def _motion(scene: Scene) -> Callable[[np.ndarray, int, int], np.ndarray]:
@@ -205,8 +203,7 @@ def _motion(scene: Scene) -> Callable[[np.ndarray, int, int], np.ndarray]:
             if isinstance(turbulence, TurbulentFlow):
                 moved = moved + turbulence.fluctuation(middle) / step
             middle = position + sense * moved / 2
-        end: np.ndarray = position + sense * moved
-        return end
+        return position + sense * moved
 
     return unsteady
 

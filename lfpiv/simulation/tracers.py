@@ -72,10 +72,6 @@ def load_tracers(file: str, first: str, second: str, scaling: TracerScaling) -> 
     scaling : TracerScaling
         Box and largest displacement.
 
-    Returns
-    -------
-    TracerSet
-
     Raises
     ------
     InputError

@@ -144,5 +144,4 @@ def _centres_mm(scene: Scene, number: int, index: np.ndarray) -> np.ndarray:
     """Return the centres (s, t) of lenses (n, 2), drift of the pitch included [mm]."""
     camera = scene.camera[number]
     regular = camera.lattice.centres_mm(index)
-    centres: np.ndarray = regular + camera.faults[:2] * regular**2
-    return centres
+    return regular + camera.faults[:2] * regular**2

@@ -115,8 +115,7 @@ class TurbulentFlow:
 
     def __call__(self, points_mm: np.ndarray) -> np.ndarray:
         """Return the displacement (n, 3) at points (n, 3) [mm]."""
-        moved: np.ndarray = self.mean(points_mm) + self.fluctuation(points_mm)
-        return moved
+        return self.mean(points_mm) + self.fluctuation(points_mm)
 
 
 @functools.lru_cache(maxsize=16)

@@ -62,8 +62,7 @@ def _views(weights: Weights, volume: xr.DataArray) -> np.ndarray:
         np.abs(weights.grid.axis_mm(number)[:, None] - volume[axis].values).argmin(0)
         for number, axis in enumerate(AXES)
     ]
-    views: np.ndarray = weights.views[np.ix_(*nearest)]
-    return views
+    return weights.views[np.ix_(*nearest)]
 
 
 def reconstructed(

@@ -64,8 +64,7 @@ class Signals:
     @property
     def ratio(self) -> np.ndarray:
         """Signal to noise of the light, least of the cameras that see it, shape (particle,)."""
-        found: np.ndarray = np.where(self.seen, self.light / np.maximum(self.error, 1e-12), np.inf).min(1)
-        return found
+        return np.where(self.seen, self.light / np.maximum(self.error, 1e-12), np.inf).min(1)
 
 
 def signals(normal: Normal, scatter: float) -> Signals:
@@ -105,8 +104,7 @@ def unexplained(normal: Normal, found: Signals) -> np.ndarray:
     share = np.clip(overlap, 0, 1)
     for one, other in ((first, second), (second, first)):
         np.add.at(square, one, share * found.strength[other] ** 2)
-    result: np.ndarray = np.sqrt(square)
-    return result
+    return np.sqrt(square)
 
 
 def misfits(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
@@ -169,8 +167,7 @@ def shown(normal: Normal, found: Signals, error: float, least: float, part: floa
     """
     by_noise = found.light > part * SIGNIFICANCE * found.error
     by_others = found.strength > part * LEFT_RATIO * error * unexplained(normal, found)
-    good: np.ndarray = by_noise & by_others & (normal.light > part * least)
-    return good
+    return by_noise & by_others & (normal.light > part * least)
 
 
 def fitting(lacking: np.ndarray, error: float, found: Signals) -> np.ndarray:
@@ -181,8 +178,7 @@ def fitting(lacking: np.ndarray, error: float, found: Signals) -> np.ndarray:
     `model_error`.
     """
     limit = (MISFIT_RATIO * error) ** 2
-    good: np.ndarray = ((lacking < limit) | ~found.seen).all(1)
-    return good
+    return ((lacking < limit) | ~found.seen).all(1)
 
 
 def merged(normal: Normal, cloud: Cloud, good: np.ndarray, position_error: np.ndarray, voxel_mm: float) -> Cloud:

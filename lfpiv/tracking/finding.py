@@ -87,10 +87,6 @@ def find_particles(
     weakest : float
         Least light of a particle, as a share of the typical one, 0 to 1.
 
-    Returns
-    -------
-    FoundParticles
-
     Raises
     ------
     ValueError
@@ -353,8 +349,7 @@ class ParticleSearch:
         assert fit.normal is not None
         found = confirmation.signals(fit.normal, fit.scatter)
         shown = confirmation.shown(fit.normal, found, fit.error, self._least(fit.cloud))
-        confirmed: np.ndarray = (shown | ~found.seen).all(1)
-        return confirmed
+        return (shown | ~found.seen).all(1)
 
     def _least(self, cloud: Cloud) -> float:
         """Return the least light of a particle [counts]."""

@@ -113,8 +113,7 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
 
     def noise(self, rows: np.ndarray) -> np.ndarray:
         """Return the variances of the errors of rows [voxel^2]."""
-        variance: np.ndarray = (rows[:, 4] + self.scatter**2) / rows[:, 5]
-        return variance
+        return (rows[:, 4] + self.scatter**2) / rows[:, 5]
 
     def smooth(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of the fluctuations between rows, and its derivative by the length's logarithm."""
@@ -136,8 +135,7 @@ class FlowCovariance(Kernel):  # type: ignore[misc]
     def diag(self, X: np.ndarray) -> np.ndarray:
         """Return the variance of each row."""
         own = np.broadcast_to(self.strength, 3)[X[:, 3].astype(int)]
-        variance: np.ndarray = own**2 + MEAN**2 + self.noise(X) + JITTER
-        return variance
+        return own**2 + MEAN**2 + self.noise(X) + JITTER
 
     def is_stationary(self) -> bool:
         """Return False: rows hold variances beside places."""
@@ -206,8 +204,7 @@ class FlowProcess:
         every = max(-(-count // MOST_SOLVED), 1)
         some = np.concatenate([np.arange(k * count, (k + 1) * count, every) for k in range(3)])
         inverse = np.linalg.inv(self.covariance(self.rows[some]))
-        found: np.ndarray = ((inverse @ self.targets[some]) / np.sqrt(np.diag(inverse))).reshape(3, -1).T
-        return found
+        return ((inverse @ self.targets[some]) / np.sqrt(np.diag(inverse))).reshape(3, -1).T
 
     def means(self, centres: np.ndarray, edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return means over windows and their standard errors.

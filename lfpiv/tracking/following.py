@@ -164,8 +164,7 @@ def _apart(positions: np.ndarray, others: np.ndarray) -> np.ndarray:
     if not (len(positions) and len(others)):
         return np.ones(len(positions), bool)
     distance, _ = cKDTree(others).query(positions)
-    found: np.ndarray = distance > NEAR_VOXEL
-    return found
+    return distance > NEAR_VOXEL
 
 
 @dataclass

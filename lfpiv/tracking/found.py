@@ -117,8 +117,7 @@ def _residuals(model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal
         share = own.values[:, 3]
         above += np.bincount(particle, share * square[own.pixel + model.first_pixel[camera]], minlength=len(cloud))
         below += np.bincount(particle, share, minlength=len(cloud))
-    found: np.ndarray = np.sqrt(above / np.maximum(below, 1e-12))
-    return found
+    return np.sqrt(above / np.maximum(below, 1e-12))
 
 
 def _crowding(normal: Normal) -> float:

@@ -81,8 +81,7 @@ class Line:
             np.bincount(place, share * values, minlength=len(places))
             for values in (known * np.square(own), known * np.square(dark) - 0.5)
         )
-        lack: np.ndarray = above / np.maximum(below, 1e-30)
-        return lack
+        return above / np.maximum(below, 1e-30)
 
 
 def follow_lines(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal, chosen: np.ndarray) -> Cloud:

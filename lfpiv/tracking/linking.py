@@ -192,8 +192,7 @@ class _Predictor:
             return np.repeat(filled[:1], len(positions_mm), axis=0)
         grid = filled.reshape(*map(len, axes), 3).squeeze(axis=tuple(np.flatnonzero(~np.array(several))))
         kept = [axis for axis, more in zip(axes, several, strict=True) if more]
-        found: np.ndarray = RegularGridInterpolator(kept, grid)(place[:, several])
-        return found
+        return RegularGridInterpolator(kept, grid)(place[:, several])
 
 
 def _matched(
@@ -296,8 +295,7 @@ def agreeing(places: np.ndarray, off: np.ndarray, error: np.ndarray) -> np.ndarr
     usual = NORMAL_MAD * np.median(np.abs(off - around), axis=0)  # a plane fits few links closely
     scatter = np.maximum(scatter, usual)
     limit = RESIDUAL_LIMIT * np.sqrt(np.square(scatter) + np.square(error))
-    valid: np.ndarray = (np.abs(off - around) < limit).all(1)
-    return valid
+    return (np.abs(off - around) < limit).all(1)
 
 
 def nearby(places: np.ndarray, off: np.ndarray, at: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

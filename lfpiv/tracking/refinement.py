@@ -73,8 +73,7 @@ class Scene:
 
     def variance(self, model: np.ndarray) -> np.ndarray:
         """Return the variance of each pixel for a model of the images [counts^2]."""
-        variance: np.ndarray = self.read_variance + np.float32(self.counts_per_photon) * np.maximum(model, 0)
-        return variance
+        return self.read_variance + np.float32(self.counts_per_photon) * np.maximum(model, 0)
 
     def residual(self, model: np.ndarray) -> np.ndarray:
         """Return what a model of the images leaves [counts]; a clipped pixel agrees with any more light."""
@@ -173,18 +172,15 @@ def solve(normal: Normal, damping: float) -> np.ndarray:
     inverse = np.linalg.inv(blocks)
 
     def apply(vector: np.ndarray) -> np.ndarray:
-        result: np.ndarray = matrix @ vector + damping * diagonal.reshape(-1) * vector
-        return result
+        return matrix @ vector + damping * diagonal.reshape(-1) * vector
 
     def precondition(vector: np.ndarray) -> np.ndarray:
-        result: np.ndarray = np.einsum("pij,pj->pi", inverse, vector.reshape(shape)).reshape(-1)
-        return result
+        return np.einsum("pij,pj->pi", inverse, vector.reshape(shape)).reshape(-1)
 
     size = normal.right.size
     operator, inner = (LinearOperator((size, size), matvec=call, dtype=float) for call in (apply, precondition))
     steps, _ = cg(operator, normal.right.reshape(-1), rtol=CG_TOLERANCE, maxiter=CG_STEPS, M=inner)
-    found: np.ndarray = steps.reshape(shape)
-    return found
+    return steps.reshape(shape)
 
 
 def diagonal_blocks(matrix: sparse.bsr_array, shape: tuple[int, int]) -> np.ndarray:

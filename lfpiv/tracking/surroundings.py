@@ -43,8 +43,7 @@ def whole_pixels(optics: Optics, lattice: LensLattice) -> np.ndarray:
     index = ((place - half) / widening - np.asarray(lattice.origin_mm)) @ np.linalg.inv(np.asarray(lattice.basis_mm))
     off = place - (lattice.centres_mm(np.rint(index)) * widening + half)
     radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
-    inside: np.ndarray = np.square(off).sum(-1) < max(radius - EDGE_PX, 1.0) ** 2
-    return inside
+    return np.square(off).sum(-1) < max(radius - EDGE_PX, 1.0) ** 2
 
 
 def surroundings(
@@ -134,5 +133,4 @@ def _stretched(tiles: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the values of tiles interpolated to pixels."""
     place = [(np.arange(length) + 0.5) / TILE_PX - 0.5 for length in shape]
     grid = np.meshgrid(*place, indexing="ij")
-    found: np.ndarray = ndimage.map_coordinates(tiles, grid, order=1, mode="nearest").astype(np.float32)
-    return found
+    return ndimage.map_coordinates(tiles, grid, order=1, mode="nearest").astype(np.float32)

@@ -124,5 +124,4 @@ def _unlike(followed: TrackedParticles, state: State, long: np.ndarray) -> np.nd
     share = np.bincount(followed.track, unlike, minlength=count) / np.maximum(
         np.bincount(followed.track, minlength=count), 1
     )
-    found: np.ndarray = long & (share[followed.track] > MOST_UNLIKE)
-    return found
+    return long & (share[followed.track] > MOST_UNLIKE)

@@ -163,8 +163,7 @@ class Measured:
     @property
     def there(self) -> np.ndarray:
         """Positions that were measured, not repeated to fill a row, shape (track, position), bool."""
-        found: np.ndarray = np.arange(self.time.shape[1]) < self.length[:, None]
-        return found
+        return np.arange(self.time.shape[1]) < self.length[:, None]
 
     def __getitem__(self, chosen: np.ndarray) -> Measured:
         return Measured(
@@ -212,8 +211,7 @@ def _inverse(variance: np.ndarray) -> np.ndarray:
     """Return the inverse of covariances (..., 3, 3) by way of their correlations, whose condition is better."""
     scale = np.sqrt(np.einsum("...ii->...i", variance))
     product = scale[..., :, None] * scale[..., None, :]
-    inverse: np.ndarray = np.linalg.pinv(variance / product, hermitian=True) / product
-    return inverse
+    return np.linalg.pinv(variance / product, hermitian=True) / product
 
 
 def unlikeliness(motion: Motion, measured: Measured) -> np.ndarray:

@@ -38,8 +38,7 @@ class Fit:
     @property
     def at_centre(self) -> np.ndarray:
         """Values at the windows' centres, shape (window, component)."""
-        values: np.ndarray = self.mean - np.einsum("wa,wac->wc", self.place, self.gradient)
-        return values
+        return self.mean - np.einsum("wa,wac->wc", self.place, self.gradient)
 
 
 def fluid_centroids(fluid: Values, windows: Windows) -> np.ndarray:
@@ -48,8 +47,7 @@ def fluid_centroids(fluid: Values, windows: Windows) -> np.ndarray:
     `fluid` is true for voxels with fluid, shape (z, y, x). The result is 0 for windows without fluid.
     """
     offsets = windows.middles(fluid) - np.stack(np.meshgrid(*windows.centres, indexing="ij"), -1)
-    centred: np.ndarray = np.nan_to_num(offsets, nan=0.0)
-    return centred
+    return np.nan_to_num(offsets, nan=0.0)
 
 
 def fit_neighbours(

@@ -77,8 +77,7 @@ class Voxels:
             return np.ones(windows.count, bool)
         if self.solid is None:
             return seen_windows(self.seen, windows)
-        enough: np.ndarray = windows.means(self.seen & ~self.solid) >= LEAST_SEEN * fluid - ROUNDING
-        return enough
+        return windows.means(self.seen & ~self.solid) >= LEAST_SEEN * fluid - ROUNDING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,5 +98,4 @@ class Coverage:
     @property
     def measurable(self) -> np.ndarray:
         """True where a vector can be measured."""
-        flags: np.ndarray = self.seen & self.seeded & ~self.masked
-        return flags
+        return self.seen & self.seeded & ~self.masked

@@ -137,8 +137,7 @@ class AxisDamping:
         if self.coherence:
             return (1 - self.slope) / (self.coherent_slope or self.slope) * weighted(displacement, self.coherence)
         mean = displacement.mean() if used is None or not used.any() else displacement[used].mean()
-        whole: np.ndarray = (1 / self.slope - 1) * (displacement - mean)
-        return whole
+        return (1 / self.slope - 1) * (displacement - mean)
 
     @property
     def used_offset(self) -> float:
@@ -267,8 +266,7 @@ class _Stored:
 def _from_mean(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Return the distance of displacements from their mean over the valid vectors."""
     known = valid if valid.any() else np.isfinite(values)
-    distance: np.ndarray = values - (float(values[known].mean()) if known.any() else 0.0)
-    return distance
+    return values - (float(values[known].mean()) if known.any() else 0.0)
 
 
 def displacement(vectors: xr.Dataset) -> np.ndarray:

@@ -66,8 +66,7 @@ def _averages(starts: np.ndarray, edge: int) -> np.ndarray:
     """Return the matrix (window, voxel) of the means over windows along an axis, given their first voxels."""
     voxels = np.arange(starts[-1] + edge)
     inside = (voxels >= starts[:, None]) & (voxels < starts[:, None] + edge)
-    averages: np.ndarray = inside / edge
-    return averages
+    return inside / edge
 
 
 def _predictor(averages: np.ndarray, length: float) -> np.ndarray:
@@ -75,8 +74,7 @@ def _predictor(averages: np.ndarray, length: float) -> np.ndarray:
     voxels = np.arange(averages.shape[1])
     distance = np.sqrt(3) * np.abs(voxels[:, None] - voxels) / length
     together = ((1 + distance) * np.exp(-distance) + LEVEL) @ averages.T
-    matrix: np.ndarray = np.linalg.solve(averages @ together + ERROR * np.eye(len(averages)), together.T).T
-    return matrix
+    return np.linalg.solve(averages @ together + ERROR * np.eye(len(averages)), together.T).T
 
 
 def _apply(matrix: np.ndarray, field: np.ndarray, axis: int) -> np.ndarray:

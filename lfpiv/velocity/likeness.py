@@ -104,8 +104,7 @@ def usable(vectors: xr.Dataset) -> np.ndarray:
 
     whole: np.ndarray = vectors["fluid_share"].values >= WHOLE_FLUID
     seeded: np.ndarray = vectors["seeded_share"].values >= LEAST_SEEDED
-    used: np.ndarray = whole & seeded & np.isfinite(vectors["displacement_x"].values)
-    return used
+    return whole & seeded & np.isfinite(vectors["displacement_x"].values)
 
 
 def octants(shape: tuple[int, ...]) -> list[np.ndarray]:

@@ -13,21 +13,18 @@ SHELL_WIDTH = 0.1
 
 def modes_of(field: np.ndarray) -> np.ndarray:
     """Return the discrete cosine transform of the fluctuations of a finite field along its first three axes."""
-    modes: np.ndarray = scipy.fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
-    return modes
+    return scipy.fft.dctn(field - field.mean((0, 1, 2)), axes=(0, 1, 2), norm="ortho")
 
 
 def field_of(modes: np.ndarray) -> np.ndarray:
     """Return the fluctuations whose modes are given."""
-    field: np.ndarray = scipy.fft.idctn(modes, axes=(0, 1, 2), norm="ortho")
-    return field
+    return scipy.fft.idctn(modes, axes=(0, 1, 2), norm="ortho")
 
 
 def shells_of(shape: tuple[int, ...]) -> np.ndarray:
     """Return the number of the shell of each mode, by its wave number."""
     waves = np.meshgrid(*(np.arange(count) / (2 * count) for count in shape), indexing="ij")
-    shells: np.ndarray = (np.sqrt(sum(wave**2 for wave in waves)) / SHELL_WIDTH).astype(int)
-    return shells
+    return (np.sqrt(sum(wave**2 for wave in waves)) / SHELL_WIDTH).astype(int)
 
 
 def coherences(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, ...]:

@@ -81,8 +81,7 @@ def unseeded_voxels(volumes: Sequence[np.ndarray], without: np.ndarray | None = 
         return None
     empty = (level < EDGE) & (ndimage.distance_transform_edt(~core) <= REACH * sigma / cell)
     nearest = (np.minimum(np.arange(n) // cell, m - 1) for n, m in zip(shape, empty.shape, strict=True))
-    flags: np.ndarray = empty[np.ix_(*nearest)]
-    return flags
+    return empty[np.ix_(*nearest)]
 
 
 def _particles(light: np.ndarray) -> tuple[np.float32, float]:
@@ -119,8 +118,7 @@ def _peaks(light: np.ndarray, step: int) -> np.ndarray:
     flat = light.ravel()
     found: np.ndarray = flat[at]
     highest = np.all([found >= flat[at + step - steps[13]] for step in steps], axis=0)
-    peaks: np.ndarray = found[highest]
-    return peaks
+    return found[highest]
 
 
 def _lit_everywhere(light: np.ndarray, usable: np.ndarray | None, sigma: float) -> bool:

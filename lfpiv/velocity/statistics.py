@@ -337,5 +337,4 @@ def _lagged_sums(values: np.ndarray, place: np.ndarray, length: int) -> np.ndarr
     spread = np.zeros((length, values.shape[1]))
     spread[place] = values
     power = np.abs(np.fft.rfft(spread, 2 * length, axis=0)) ** 2  # padding to twice the length avoids wrap-around
-    sums: np.ndarray = np.fft.irfft(power.sum(1))[:length]
-    return sums
+    return np.fft.irfft(power.sum(1))[:length]

@@ -70,8 +70,7 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, sh
         return random
     typical, mean = np.median(random[known], axis=0), field[known].mean(axis=0)
     systematic = share * typical**2 + (DAMPING * (field - mean)) ** 2
-    whole: np.ndarray = np.sqrt(random**2 + systematic)
-    return whole
+    return np.sqrt(random**2 + systematic)
 
 
 def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
@@ -84,5 +83,4 @@ def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
     distance : ndarray
         Displacement minus its mean over the valid vectors [voxel].
     """
-    own: np.ndarray = np.maximum(np.square(stated, dtype=float) - (DAMPING * distance) ** 2, 0)
-    return own
+    return np.maximum(np.square(stated, dtype=float) - (DAMPING * distance) ** 2, 0)

@@ -163,8 +163,7 @@ def seen_by_two(volume_a: xr.DataArray | np.ndarray, volume_b: xr.DataArray | np
     for count in views:
         if count.dims != AXES:
             raise ValueError(f"{VIEWS}: expected a coordinate over (z, y, x), got {count.dims}.")
-    both: np.ndarray = np.minimum(views[0].values, views[-1].values) >= 2
-    return both
+    return np.minimum(views[0].values, views[-1].values) >= 2
 
 
 def solid_voxels(

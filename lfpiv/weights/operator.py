@@ -171,8 +171,7 @@ class Weights(Shown):
             raise ValueError(f"voxel: expected (iz, iy, ix) inside the grid {self.grid.shape}, got {tuple(voxel)}.")
         image = np.zeros(setup.optics.sensor_shape, np.float32)
         add_entries(image, self._projectors[camera], self.stored.index(voxel))
-        weights: np.ndarray = image * setup.gain
-        return weights
+        return image * setup.gain
 
     def projector(self, name: str) -> RayProjector:
         """Return one camera's stored weights, without white-image gain."""
@@ -347,10 +346,6 @@ def build_weights(
         Memory that the weights may take [byte]; default: no limit.
     progress : callable, optional
         Called with the finished fraction.
-
-    Returns
-    -------
-    Weights
 
     Raises
     ------

@@ -224,11 +224,9 @@ def _spline_matrix(nodes: np.ndarray, voxels: int) -> np.ndarray:
     wanted = np.arange(-1, voxels + 1)
     if len(nodes) == len(wanted):
         return np.eye(len(nodes), dtype=np.float32)
-    matrix: np.ndarray = CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
-    return matrix
+    return CubicSpline(nodes, np.eye(len(nodes)))(wanted).astype(np.float32)
 
 
 def _finite(model: np.ndarray) -> np.ndarray:
     """Replace infinite coefficients, of a voxel in the lens's plane, by a point far off the sensor."""
-    finite: np.ndarray = np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)
-    return finite
+    return np.nan_to_num(model, copy=False, nan=1e9, posinf=1e9, neginf=-1e9)

@@ -103,10 +103,6 @@ def open_weights(folder: Path, cameras: Mapping[str, CalibratedCamera], content:
     content : str, optional
         Hash that `save_weights` returned. The arrays are read once to compare it. Without it they are not verified.
 
-    Returns
-    -------
-    Weights
-
     Raises
     ------
     InputError

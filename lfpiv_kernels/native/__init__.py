@@ -96,8 +96,7 @@ def kernel(call: str, *threads: str, registers: int = 0) -> Callable[[Callable[.
         place = f"<kernel {function.__module__}.{name}>"
         linecache.cache[place] = len(source), None, source.splitlines(keepends=True), place  # Warp reads its source
         exec(compile(source, place, "exec"), names)
-        declared: wp.Kernel = names[name]
-        return declared
+        return names[name]
 
     return declare
 

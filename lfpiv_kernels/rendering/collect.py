@@ -217,10 +217,6 @@ def widest_spread(camera: RenderCamera, normal: np.ndarray, level_mm: float, see
         Product of the normal and a point of the plane in the camera's frame [mm].
     seed : int
         Seed of the rays that are tried.
-
-    Returns
-    -------
-    float
     """
     rng = np.random.default_rng(seed)
     radius, turn = np.sqrt(rng.random(SPREAD_RAYS)), rng.uniform(0, 2 * np.pi, SPREAD_RAYS)

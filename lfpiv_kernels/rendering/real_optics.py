@@ -226,8 +226,7 @@ def lens_offsets(array_mm: np.ndarray, pupil: np.ndarray, aberrations: np.ndarra
     """
     h, p = np.asarray(array_mm, float) * aberrations[3], np.asarray(pupil, float) * aberrations[2]
     factors = lens_terms(h, p) @ np.asarray(lens, float).reshape(-1, 4)
-    found: np.ndarray = factors[..., 0::2, None] * h[..., None, :] + factors[..., 1::2, None] * p[..., None, :]
-    return found
+    return factors[..., 0::2, None] * h[..., None, :] + factors[..., 1::2, None] * p[..., None, :]
 
 
 def object_lines(

@@ -63,10 +63,6 @@ def measure_board(
     dark : ndarray, shape (rows, columns), optional
         Image with the lens capped [counts].
 
-    Returns
-    -------
-    BoardDots
-
     Raises
     ------
     InputError
@@ -147,8 +143,7 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
     bad = misfit > max(OUTLIER * NORMAL_MAD * float(np.median(misfit)), OUTLIER_PITCH * pitch_mm)
     if bad.any():
         log.info("%d dots lie elsewhere than their neighbours demand and are left out", bad.sum())
-    good: np.ndarray = ~bad[inverse]
-    return good
+    return ~bad[inverse]
 
 
 def _count(labels: Labels, board: DotBoard, detection: Detection) -> BoardDots:

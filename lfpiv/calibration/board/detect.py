@@ -269,8 +269,7 @@ def lit_share(pose: CameraPose, points: np.ndarray, decoder: LightFieldDecoder) 
     rows, columns = decoder.optics.sensor_shape
     on_sensor = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     at = np.where(on_sensor, row, 0).astype(int), np.where(on_sensor, column, 0).astype(int)
-    share: np.ndarray = (on_sensor & (decoder.smooth_gain[at] > _LIT_GAIN)).mean(1)
-    return share
+    return (on_sensor & (decoder.smooth_gain[at] > _LIT_GAIN)).mean(1)
 
 
 def in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:
@@ -278,8 +277,7 @@ def in_field(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray
     position = _light_px(pose, points, optics)
     rows, columns = optics.sensor_shape
     inside = (position > -0.5) & (position < np.array([columns, rows]) - 0.5)
-    half: np.ndarray = np.all(inside, axis=-1).mean(1) >= 0.5
-    return half
+    return np.all(inside, axis=-1).mean(1) >= 0.5
 
 
 def _light_px(pose: CameraPose, points: np.ndarray, optics: Optics) -> np.ndarray:

@@ -103,8 +103,7 @@ class LensIntegral:
 
     def rays_mm(self, terms: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return s(u) [mm], shape (n, 2), from `ray_terms` and the dot's own coefficients."""
-        rays: np.ndarray = terms @ self._bent(theta)
-        return rays
+        return terms @ self._bent(theta)
 
     def pixel_terms(self, pupil_mm: np.ndarray) -> np.ndarray:
         """Return the terms of the ray model in the mean over the rays of each pixel, shape (n, TERMS + bends).
@@ -162,8 +161,7 @@ class LensIntegral:
 
     def pupil_reach_mm(self, theta: np.ndarray) -> np.ndarray:
         """Return a bound on how far rays move from the chief ray over the pupil along (s, t) [mm], shape (2,)."""
-        bound: np.ndarray = np.abs(self._bent(theta)[1:]).sum(0)
-        return bound
+        return np.abs(self._bent(theta)[1:]).sum(0)
 
     def support_mm(self, board_jacobian: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the half extent (s, t) of F [mm]: a lens further away receives no light of the dot, shape (2,)."""
@@ -171,8 +169,7 @@ class LensIntegral:
 
     def _support_mm(self, ellipse: np.ndarray, pixel: np.ndarray) -> np.ndarray:
         blurred = np.abs(pixel).sum(1) * (0.5 + 2 * self.shared.blur_px)
-        extent: np.ndarray = self.cell_reach_mm + np.hypot(*ellipse.T) + blurred
-        return extent
+        return self.cell_reach_mm + np.hypot(*ellipse.T) + blurred
 
     def table(self, board_jacobian: np.ndarray, tilt: np.ndarray, theta: np.ndarray) -> LensTable:
         """Tabulate F and its derivatives for one dot, for a pixel typical of the pupil.
@@ -201,14 +198,12 @@ class LensIntegral:
         bent, (per_u, per_v) = self._bent(theta), _derivatives(self.shared.order)
         slope = (terms[:, : len(per_u)] @ np.hstack([per_u @ bent, per_v @ bent])).T / self.optics.pupil_radius_mm
         a, b, c, d = 1 - slope[0], -slope[2], -slope[1], 1 - slope[3]
-        inverse: np.ndarray = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
-        return inverse
+        return np.array([[d, -b], [-c, a]]) / (a * d - b * c)
 
     def _ellipse(self, board_jacobian: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the half axes of the dot's image, as columns [mm]."""
         magnified = np.eye(2) - slope_of(theta, self.optics.pupil_radius_mm)
-        ellipse: np.ndarray = np.linalg.solve(magnified, board_jacobian * (self.shared.diameter_mm / 2))
-        return ellipse
+        return np.linalg.solve(magnified, board_jacobian * (self.shared.diameter_mm / 2))
 
     def _pixel(self, theta: np.ndarray) -> np.ndarray:
         """Return the sides of a pixel's image on the array, as columns [mm], mean square over the pupil."""
@@ -217,8 +212,7 @@ class LensIntegral:
         spread, axes = np.linalg.eigh(np.einsum("nab,ncb->ac", sides, sides) / len(sides))
         size = axes * np.sqrt(np.maximum(spread, 0)) @ axes.T
         left, _, right = np.linalg.svd(sides[0])
-        pixel: np.ndarray = size @ left @ right * self.optics.pupil_pixel_mm  # orientation of the central pixel
-        return pixel
+        return size @ left @ right * self.optics.pupil_pixel_mm  # orientation of the central pixel
 
 
 class LensTable:
@@ -236,8 +230,7 @@ class LensTable:
         frequency = [fft.fftfreq(TABLE, step_mm)[:, None], fft.rfftfreq(TABLE, step_mm)[None]]
 
         def along(vector: np.ndarray) -> np.ndarray:
-            product: np.ndarray = vector[0] * frequency[0] + vector[1] * frequency[1]
-            return product
+            return vector[0] * frequency[0] + vector[1] * frequency[1]
 
         axes = [2 * np.pi * along(ellipse[:, axis]) for axis in (0, 1)]
         phase = np.hypot(*axes)
@@ -319,8 +312,7 @@ def zone_of(pupil: np.ndarray) -> np.ndarray:
     """Return the zone of pupil points [pupil radii], shape (n,)."""
     ring = np.searchsorted(_RINGS, np.linalg.norm(pupil, axis=1))
     sector = np.floor(np.arctan2(pupil[:, 1], pupil[:, 0]) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-    zone: np.ndarray = np.where(ring == 0, 0, 1 + (ring - 1) * _SECTORS + sector)
-    return zone
+    return np.where(ring == 0, 0, 1 + (ring - 1) * _SECTORS + sector)
 
 
 def zone_shares() -> np.ndarray:
@@ -334,8 +326,7 @@ def zone_middles() -> np.ndarray:
     edge = np.array([*_RINGS, 1])
     radius = np.append(0, np.repeat((edge[1:] + edge[:-1]) / 2, _SECTORS))
     angle = np.append(0, np.tile((np.arange(_SECTORS) + 0.5) / _SECTORS * 2 * np.pi, len(_RINGS)))
-    middles: np.ndarray = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return middles
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def slope_of(theta: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
@@ -347,8 +338,7 @@ def slope_of(theta: np.ndarray, pupil_radius_mm: float) -> np.ndarray:
 def _cell_reach(basis: Basis) -> np.ndarray:
     """Return the half extent (s, t) of the lattice's Voronoi cell [mm], shape (2,)."""
     voronoi = Voronoi(np.vstack([np.zeros(2), _neighbours(basis)]))
-    reach: np.ndarray = np.abs(voronoi.vertices[voronoi.regions[voronoi.point_region[0]]]).max(0)
-    return reach
+    return np.abs(voronoi.vertices[voronoi.regions[voronoi.point_region[0]]]).max(0)
 
 
 @functools.cache
@@ -383,11 +373,9 @@ def _cell_spectrum(basis: Basis, step_mm: float) -> np.ndarray:
         inside *= np.clip(0.5 - beyond * _RASTER / step_mm, 0, 1)  # part of a sample within the cell
     share = inside.reshape(TABLE, _RASTER, TABLE, _RASTER).mean((1, 3))
     smooth = np.sinc(fft.fftfreq(TABLE))[:, None] * np.sinc(fft.rfftfreq(TABLE))
-    spectrum: np.ndarray = fft.rfft2(fft.ifftshift(share)) / smooth**3
-    return spectrum
+    return fft.rfft2(fft.ifftshift(share)) / smooth**3
 
 
 def _neighbours(basis: Basis) -> np.ndarray:
     """Return the vectors to the eight lattice neighbours of a lens [mm], shape (8, 2)."""
-    neighbours: np.ndarray = NEIGHBOURS @ np.asarray(basis)
-    return neighbours
+    return NEIGHBOURS @ np.asarray(basis)

@@ -163,8 +163,7 @@ def _extent(found: np.ndarray, in_view: np.ndarray, stated: int) -> Extent | Non
 def _occupied(counts: np.ndarray) -> np.ndarray:
     """Return the lines of one plane that hold about as many dots as the typical one, bool."""
     typical = np.median(counts[counts > 0]) if (counts > 0).any() else np.inf
-    occupied: np.ndarray = counts >= OCCUPIED * typical
-    return occupied
+    return counts >= OCCUPIED * typical
 
 
 def _per_plane(found: np.ndarray) -> str:

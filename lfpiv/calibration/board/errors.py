@@ -49,8 +49,7 @@ class BoardErrors:
     @property
     def depth_mm(self) -> np.ndarray:
         """Fitted depth of each plane's middle [mm], shape (plane,)."""
-        depth: np.ndarray = self.planes_mm + self.plane[:, 2]
-        return depth
+        return self.planes_mm + self.plane[:, 2]
 
     def points_mm(self, board: DotBoard, dot: np.ndarray) -> np.ndarray:
         """Return the corrected world positions of dots given by number, shape (n, 3) [mm]."""
@@ -61,8 +60,7 @@ class BoardErrors:
         on_board = points - middle
         on_board[:, :2] += self.dot_mm[site]
         turned = Rotation.from_rotvec(self.plane[plane, 3:]).apply(on_board)
-        moved: np.ndarray = turned + middle + self.plane[plane, :3]
-        return moved
+        return turned + middle + self.plane[plane, :3]
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures of the planes and the dots' scatter, as the summary stores them."""

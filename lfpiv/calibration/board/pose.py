@@ -74,8 +74,7 @@ class CameraPose:
     def rotation(self) -> np.ndarray:
         """Rotation from world to camera axes, shape (3, 3)."""
         yaw, pitch, roll = self.parameters[:3]
-        rotation: np.ndarray = camera_rotation(yaw, pitch, roll) @ self.nominal_rotation
-        return rotation
+        return camera_rotation(yaw, pitch, roll) @ self.nominal_rotation
 
     def rays(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the array positions of chief rays [mm], (n, 2), and the slopes k = ds/du of the rays, (n,)."""
@@ -110,8 +109,7 @@ class CameraPose:
         z = dtype.type(z_mm * self.depth - self.parameters[5])
         share = (z - near[:, 2]) / (far[:, 2] - near[:, 2])
         offset = np.array(self.parameters[3:5], dtype)
-        crossing: np.ndarray = near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + offset
-        return crossing
+        return near[:, :2] + share[:, None] * (far[:, :2] - near[:, :2]) + offset
 
     def fitted(
         self, points_mm: np.ndarray, array_mm: np.ndarray, optics: Optics, slope: np.ndarray | None = None
@@ -160,8 +158,7 @@ class Blobs:
         """Blobs that are dots: significant, and not faint against the typical significant blob, bool, shape (n,)."""
         significant = self.contrast > _SIGNIFICANT
         typical = np.median(self.contrast[significant]) if significant.any() else np.inf
-        strong: np.ndarray = significant & (self.contrast > _FAINTEST * typical)
-        return strong
+        return significant & (self.contrast > _FAINTEST * typical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +211,7 @@ class Rectified:
             bend = 2 * centre - ahead - behind
             half = np.divide(ahead - behind, 2 * bend, out=np.zeros(len(row)), where=bend > 0)
             shift.append(np.clip(half, -0.5, 0.5))
-        peak: np.ndarray = self.corner_mm + (np.stack([col, row], -1) + np.stack(shift, -1)) * self.bin_mm
-        return peak
+        return self.corner_mm + (np.stack([col, row], -1) + np.stack(shift, -1)) * self.bin_mm
 
 
 class Rectifier:

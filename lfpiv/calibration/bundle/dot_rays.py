@@ -86,8 +86,7 @@ def _pupil_terms(pupil: np.ndarray) -> np.ndarray:
 
 def without(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the part of columns that is orthogonal to a basis."""
-    rest: np.ndarray = columns - basis @ (basis.T @ columns)
-    return rest
+    return columns - basis @ (basis.T @ columns)
 
 
 def thin_lens_rays(lens: ThinLensModel, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -94,5 +94,4 @@ def _complement(columns: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis of the vectors orthogonal to columns."""
     left, strength, _ = np.linalg.svd(columns)
     rank = int((strength > 1e-9 * strength[0]).sum())
-    rest: np.ndarray = left[:, rank:]
-    return rest
+    return left[:, rank:]

@@ -185,8 +185,7 @@ class WeightedEquations:
         """Return the residuals in standard deviations, freed of the part that the unknowns take, shape (2, rows)."""
         taken = (self.basis**2).sum(1) + ((self.effects @ solution.covariance) * self.effects).sum(2)
         rest = self.departure - self.effects @ solution.values
-        scaled: np.ndarray = rest / np.sqrt(np.maximum(1 - taken, LEAST_FREEDOM))
-        return scaled
+        return rest / np.sqrt(np.maximum(1 - taken, LEAST_FREEDOM))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

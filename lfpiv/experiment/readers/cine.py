@@ -207,5 +207,4 @@ def _linear_counts() -> Callable[[bytes], np.ndarray]:
             f"packed 10-bit images are read with the package cine-handler, {found}. Install the extra phantom with "
             "pip install 'lfpiv[phantom]', or save the recording with 16 bits."
         ) from None
-    unpack: Callable[[bytes], np.ndarray] = unpack_10bit_numpy
-    return unpack
+    return unpack_10bit_numpy

@@ -154,8 +154,7 @@ def read(image: ImagePath) -> np.ndarray:
     _checked(dataset, number)
     if dataset.chunks is not None:
         return read_chunks(dataset, number)
-    pixels: np.ndarray = dataset[()] if number is None else dataset[number]
-    return pixels
+    return dataset[()] if number is None else dataset[number]
 
 
 def _checked(dataset: h5py.Dataset, number: int | None) -> Header:

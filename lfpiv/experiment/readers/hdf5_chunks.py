@@ -90,8 +90,7 @@ def _by_hdf5(dataset: h5py.Dataset, number: int | None, size: int) -> np.ndarray
         skipped = mask >> (len(filters) - 1) & 1  # as szip is where it would make a chunk larger
         if filters[-1][0] == SZIP and not skipped and int.from_bytes(stored[:4], "little") > size:
             raise ValueError(f"a chunk of {len(stored)} bytes states more than the {size} bytes of its pixels")
-    pixels: np.ndarray = dataset[()] if number is None else dataset[number]
-    return pixels
+    return dataset[()] if number is None else dataset[number]
 
 
 def _undone(stored: bytes, number: int, values: tuple[int, ...], item_bytes: int, size: int) -> bytes:

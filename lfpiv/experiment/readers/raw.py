@@ -51,5 +51,4 @@ class Raw(Frames):
         assert self._time is not None
         dtype = np.dtype(self._time.dtype).newbyteorder(self._byte_order)
         start = self._first + number * self._step + self._time.at_byte
-        stamp: int | float = np.frombuffer(read_bytes(self.file, start, dtype.itemsize), dtype)[0].item()
-        return stamp
+        return np.frombuffer(read_bytes(self.file, start, dtype.itemsize), dtype)[0].item()

@@ -240,13 +240,11 @@ class CameraProfiles:
 
     @cached_property
     def _first_column(self) -> np.ndarray:
-        first: np.ndarray = np.floor(self._of_strips.min(1) - radius_px(self.camera)).astype(np.int32)
-        return first
+        return np.floor(self._of_strips.min(1) - radius_px(self.camera)).astype(np.int32)
 
     @cached_property
     def _first_row(self) -> np.ndarray:
-        first: np.ndarray = np.floor(self._centres[..., 1].min(1) - radius_px(self.camera)).astype(np.int32)
-        return first
+        return np.floor(self._centres[..., 1].min(1) - radius_px(self.camera)).astype(np.int32)
 
     @property
     def _middle(self) -> np.ndarray:

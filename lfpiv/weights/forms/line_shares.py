@@ -37,11 +37,9 @@ def line_shares(place: np.ndarray) -> np.ndarray:
     exact = np.stack([np.ones(LINES), lines])
     kriging = np.block([[_covariance(lines[:, None] - lines), exact.T], [exact, np.zeros((2, 2))]])
     sides = np.concatenate([_covariance(lines[:, None] - place), np.ones((1, len(place))), place[None]])
-    shares: np.ndarray = np.linalg.solve(kriging, sides)[:LINES].T
-    return shares
+    return np.linalg.solve(kriging, sides)[:LINES].T
 
 
 def _covariance(distance: np.ndarray) -> np.ndarray:
     """Return the autocovariance of the image at a distance [voxel], relative to that at none."""
-    found: np.ndarray = np.exp(-np.square(distance) / (4 * VARIANCE_VOXEL))
-    return found
+    return np.exp(-np.square(distance) / (4 * VARIANCE_VOXEL))

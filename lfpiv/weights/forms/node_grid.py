@@ -88,25 +88,21 @@ class NodeGrid:
     def _plane(self) -> np.ndarray:
         """First of the four planes of each layer, shape (layer,)."""
         place = (np.arange(self.stored.shape[self.axes[1]]) - self._first_layer) / self.distance
-        plane: np.ndarray = np.clip(np.floor(place).astype(int) - 1, 0, self._planes - TAPS)
-        return plane
+        return np.clip(np.floor(place).astype(int) - 1, 0, self._planes - TAPS)
 
     def _whole(self, layer: np.ndarray) -> np.ndarray:
         """Return the whole rows and columns by which the line of sight through voxel 0 of layer 0 has moved."""
-        whole: np.ndarray = np.ceil(layer[..., None] * np.array(self.slopes)).astype(int)
-        return whole
+        return np.ceil(layer[..., None] * np.array(self.slopes)).astype(int)
 
     def _parts(self, layer: np.ndarray) -> np.ndarray:
         """Return the parts of a row and of a column, above -1 and at most 0, by which it has moved besides."""
-        parts: np.ndarray = layer[..., None] * np.array(self.slopes) - self._whole(layer)
-        return parts
+        return layer[..., None] * np.array(self.slopes) - self._whole(layer)
 
     @cached_property
     def _moved(self) -> np.ndarray:
         """Rows and columns from each layer's lines of sight to their nodes on four planes, shape (layer, 4, 2)."""
         planes = self._first_layer + self.distance * (self._plane[:, None] + np.arange(TAPS))
-        moved: np.ndarray = self._whole(planes) - self._whole(np.arange(len(planes)))[:, None]
-        return moved
+        return self._whole(planes) - self._whole(np.arange(len(planes)))[:, None]
 
     @cached_property
     def _aside(self) -> tuple[np.ndarray, np.ndarray]:
@@ -176,8 +172,7 @@ def line_of_sight(camera: CalibratedCamera, point_mm: np.ndarray, pupil_mm: Arra
     """
     step = 0.5 * np.eye(3)
     places = camera.map(np.concatenate([point_mm + step, point_mm - step]), np.tile(pupil_mm, (6, 1)))
-    direction: np.ndarray = np.linalg.svd(np.asarray(places[:3] - places[3:], float).T)[2][2]
-    return direction
+    return np.linalg.svd(np.asarray(places[:3] - places[3:], float).T)[2][2]
 
 
 def slopes_of(stored: StoredGrid, camera: CalibratedCamera) -> tuple[tuple[int, int, int], np.ndarray]:
