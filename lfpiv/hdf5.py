@@ -57,7 +57,6 @@ class Disk(FileIO):
 
     Parameters
     ----------
-    path : Path
     mode : {"w+", "r+"}
         Make a new file, or change one.
     """
@@ -147,7 +146,6 @@ def opened(path: str | Path, *, values: bool = True) -> Iterator[h5py.File]:
 
     Parameters
     ----------
-    path : str or Path
     values : bool
         Whether arrays are read. If only attributes are, the structure is not checked.
 

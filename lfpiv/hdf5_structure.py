@@ -24,7 +24,6 @@ def check_structure(file: h5py.File, size: int) -> None:
 
     Parameters
     ----------
-    file : h5py.File
     size : int
         Size of the file [byte].
 

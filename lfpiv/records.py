@@ -104,7 +104,6 @@ def validate(kind: type[T], stored: Any) -> T:
 
     Parameters
     ----------
-    kind : type
     stored : object
         From `read_json`.
 

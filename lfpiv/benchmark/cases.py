@@ -106,11 +106,6 @@ def names() -> tuple[str, ...]:
 def case_of(name: str) -> Case:
     """Return a case.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-
     Raises
     ------
     InputError
@@ -127,8 +122,6 @@ def scene_of(case: Case, *, seed: int | None = None, tracers: str | Path | None 
 
     Parameters
     ----------
-    case : Case
-        The case.
     seed : int, optional
         Seed in place of the benchmark's. Particles, noise and turbulence are then others; the rig is the same.
     tracers : path, optional

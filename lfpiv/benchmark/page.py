@@ -57,8 +57,6 @@ def write_page(truth: Truth, scores: Sequence[Score], path: Path) -> None:
 
     Parameters
     ----------
-    truth : Truth
-        The truth.
     scores : sequence of Score
         Scores of results on this data set.
     path : Path

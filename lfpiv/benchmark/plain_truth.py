@@ -78,11 +78,6 @@ def true_particles(scene: Scene) -> dict[str, np.ndarray]:
 def flow_truth(scene: Scene) -> xr.Dataset:
     """Return the true displacement and velocity, averaged over the windows of the recommended grid.
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-
     Returns
     -------
     Dataset
@@ -122,8 +117,6 @@ def write_particles(particles: dict[str, np.ndarray], path: Path) -> None:
     ----------
     particles : dict
         Arrays as in ``truth/particles.npz``. Positions of pairs are midway in time, those of instants at the instant.
-    path : Path
-        The file.
     """
     groups = sorted({name.removesuffix("_positions_mm") for name in particles if name.endswith("_positions_mm")})
     number = groups[0].split("_")[0]

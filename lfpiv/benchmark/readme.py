@@ -23,8 +23,6 @@ def readme(case: Case, scene: Scene) -> str:
 
     Parameters
     ----------
-    case : Case
-        The case.
     scene : Scene
         Its scene. The text says nothing of the truth.
     """

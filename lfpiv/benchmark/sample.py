@@ -106,8 +106,6 @@ class Sample:
     ----------
     pairs : sequence of PairErrors
         All pairs that are scored, also pairs without vectors.
-    truth : Truth
-        The truth.
     outlier_voxel : float
         Length of the error above which a vector is an outlier [voxel].
     """

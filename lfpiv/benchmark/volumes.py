@@ -28,8 +28,6 @@ def score_volumes(path: Path, truth: Truth) -> dict[str, list[float]]:
     path : Path
         A NetCDF file of one volume, or a folder of them. The end of a name says pair and frame: ``pair_0000_b.nc``;
         of a time series the instant. A name without one is the first frame of the first pair.
-    truth : Truth
-        The truth.
 
     Returns
     -------

@@ -60,8 +60,6 @@ class RecordedImages:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     light : callable
         Relative light of a particle at a place.
     """
@@ -139,13 +137,7 @@ def random_places(grid: Grid, count: float, rng: np.random.Generator) -> np.ndar
 
 
 class SyntheticPair:
-    """Images of both frames of random particles, moved by a field.
-
-    Parameters
-    ----------
-    recorded : RecordedImages
-    particles : RecordedParticles
-    """
+    """Images of both frames of random particles, moved by a field."""
 
     def __init__(self, recorded: RecordedImages, particles: RecordedParticles):
         self.recorded, self.particles = recorded, particles

@@ -159,7 +159,6 @@ class Experiment(Shown):
 
         Parameters
         ----------
-        frame : Frame
         grid : Grid, optional
             Grid of the flags, each of which is that of the nearest voxel; default: the voxels of the experiment.
 

@@ -33,7 +33,6 @@ def explain(error: ValidationError, model: type[BaseModel], values: Mapping[str,
 
     Parameters
     ----------
-    error : ValidationError
     model : type
         The model that the values do not fit.
     values : mapping

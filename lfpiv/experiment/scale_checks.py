@@ -41,8 +41,6 @@ def require_scale(path: Path, volume: Volume, board: NominalBoard, cameras: Sequ
     ----------
     path : Path
         The experiment file, for messages.
-    volume : Volume
-    board : NominalBoard
     cameras : sequence of CameraSetup
         All cameras. The finest of them decides what is too small, the widest what is too large.
 

@@ -40,8 +40,6 @@ def read_toml(path: Path, model: type[Model]) -> Model:
 
     Parameters
     ----------
-    path : Path
-        The file.
     model : type
         A pydantic model that forbids unknown keys.
 

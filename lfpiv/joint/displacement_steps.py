@@ -75,8 +75,6 @@ class RayPart:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     subset : Subset
         Sets of the rays; every ray where they are ``ALL``.
     """

@@ -44,8 +44,6 @@ class JointModel:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     frames : sequence of two PreparedFrame
         Prepared images of both frames.
     """

@@ -48,8 +48,6 @@ class Normalisation:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     settings : SmartSettings
         Settings of the reconstruction.
     subsets : tuple of Subset
@@ -58,8 +56,6 @@ class Normalisation:
         True for voxels without fluid.
     camera_gains : mapping of str to float
         Brightness of each camera relative to the brightest.
-    sieve : Sieve
-        The sieve.
     """
 
     def __init__(

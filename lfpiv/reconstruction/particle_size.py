@@ -230,8 +230,6 @@ class ParticleSizer:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     even : mapping of str to ndarray, optional
         Images of the evenly lit volume that the cameras record. Default: projected; required if the weights are those
         of a part of the volume.

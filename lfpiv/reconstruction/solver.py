@@ -36,8 +36,6 @@ class SmartSolver:
 
     Parameters
     ----------
-    weights : Weights
-        The operator.
     settings : SmartSettings
         Settings of every reconstruction.
     """

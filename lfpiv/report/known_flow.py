@@ -84,8 +84,6 @@ def compare(vectors: xr.Dataset, scene: Scene, pair: int) -> Comparison:
     ----------
     vectors : Dataset
         Vectors of a pair, or of an instant and the one after it.
-    scene : Scene
-        The scene.
     pair : int
         Number of the pair or instant.
 

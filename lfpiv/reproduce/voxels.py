@@ -81,8 +81,6 @@ def demanded(
     ----------
     rig : Rig
         The cameras, with the network's mapping.
-    volume : Grid
-        The volume.
     path : Path
         File that keeps the measured size of the particles.
     settings : mapping

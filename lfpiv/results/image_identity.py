@@ -125,7 +125,6 @@ def look_at(sources: Iterable[ImagePath], start: Path, *, condensed: bool = Fals
 
     Parameters
     ----------
-    sources : iterable of ImagePath
     start : Path
         Folder of the experiment file.
     condensed : bool

@@ -263,7 +263,6 @@ def read_volume(path: Path, *, grid: Grid | None = None) -> xr.DataArray:
 
     Parameters
     ----------
-    path : Path
     grid : Grid, optional
         The voxels that it must have. A file that declares others is not read.
 

@@ -52,8 +52,6 @@ def write_poly_data(
     ----------
     table : Dataset
         Points, one after the other.
-    path : Path
-        The file.
     vectors : mapping
         Name of a vector -> names of its components in the table.
     scalars : iterable of str

@@ -89,7 +89,6 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
 
     Parameters
     ----------
-    experiment : Experiment
     calibration : str
         Hash of the calibration's stamp.
     pairs : sequence of int

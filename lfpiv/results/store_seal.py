@@ -149,7 +149,6 @@ def zarr_digests(path: Path, *, whole: bool = True) -> dict[str, str]:
 
     Parameters
     ----------
-    path : Path
     whole : bool
         Read the values of the variables too; otherwise only the outline is returned.
 

@@ -32,7 +32,6 @@ def read(path: Path, parse: Callable[[dict[str, Any]], T]) -> tuple[T, Marks] | 
 
     Parameters
     ----------
-    path : Path
     parse : callable
         Takes the content of the file. Raises RecordError if the outcome's entries have another form.
     """

@@ -73,7 +73,6 @@ def parallel(
     ----------
     shared : Path
         Folder with everything that the workers need, from `task.write_task`.
-    experiment : Experiment
     pending : iterable of int
         Pairs to do; each is taken when a worker is free.
     workers : Plan or str

@@ -114,8 +114,6 @@ def static_light(scene: Scene, number: int, white: np.ndarray) -> StaticLight | 
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     number : int
         Number of the camera.
     white : ndarray, shape (rows, columns)
@@ -171,8 +169,6 @@ def camera_images(
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     number : int
         Number of the camera.
     pairs : list of LitParticles
@@ -245,8 +241,6 @@ def series_images(
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     number : int
         Number of the camera.
     instants : list of SeriesInstant

@@ -53,8 +53,6 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     pair : int
         Number of the pair, from 0. Each pair has its own particles.
 

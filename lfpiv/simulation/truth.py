@@ -42,8 +42,6 @@ def write_scene(scene: Scene, placed: Sequence[LitParticles | SeriesInstant], fo
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     placed : sequence of LitParticles or SeriesInstant
         Particles of each pair, or of each instant of a series.
     folder : Path
@@ -64,8 +62,6 @@ def particle_arrays(scene: Scene, placed: Sequence[LitParticles | SeriesInstant]
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     placed : sequence of LitParticles or SeriesInstant
         Particles of each pair, or of each instant of a series.
 
@@ -110,8 +106,6 @@ def write_camera(
 
     Parameters
     ----------
-    scene : Scene
-        The scene.
     number : int
         Number of the camera.
     folder : Path

@@ -215,8 +215,6 @@ def blocks_of(
 
     Parameters
     ----------
-    packed : PackedCamera
-        The camera.
     models : iterable of ndarray, shape (voxel, 38), float32
         Ray models, one batch after the other.
     form : {"profiles", "pixels"}

@@ -85,7 +85,6 @@ def filter_along(
     Parameters
     ----------
     volume : wp.array, shape (z, y, x), float32
-    axis : int
     taps : ndarray, shape (tap,)
     first : int
         Voxel of the first tap for sum 0; negative in the margin or outside.

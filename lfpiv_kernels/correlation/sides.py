@@ -87,7 +87,6 @@ def make_sides(
 
     Parameters
     ----------
-    plan : Plan
     volumes : two wp.array, shape (z, y, x), float32
     moments : two tuple of float
         Mean and sum of squares of each volume.

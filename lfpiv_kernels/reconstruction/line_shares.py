@@ -52,8 +52,6 @@ class LineShares:
         The shares.
     along_rows : bool
         Whether places on a line are rows; else columns.
-    voxels : Layers
-        The voxels.
     """
 
     def __init__(self, share: np.ndarray, along_rows: bool, voxels: Layers):

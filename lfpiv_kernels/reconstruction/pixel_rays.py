@@ -161,8 +161,6 @@ class RayMap:
         Where each part's rays begin, and the end of the last.
     starts : sequence of int
         The first ray of each part. A ray may lie in several parts; their light adds up.
-    sets : RaySets
-        Sets of rays.
     darken : bool
         Whether `spread` writes zero on rays that voxels light but no pixel of the set sees.
     places : callable, optional

@@ -114,8 +114,6 @@ class SeparableProjector(RayProjector):
 
     Parameters
     ----------
-    weights : SeparableWeights
-        The weights.
     sets : int
         Number of sets of rays.
     """

@@ -209,8 +209,6 @@ def widest_spread(camera: RenderCamera, normal: np.ndarray, level_mm: float, see
 
     Parameters
     ----------
-    camera : RenderCamera
-        The camera.
     normal : ndarray, shape (3,)
         Unit normal of the plane in the camera's frame.
     level_mm : float
@@ -296,8 +294,6 @@ def render_white(camera: RenderCamera, *, samples: int, seed: int) -> np.ndarray
 
     Parameters
     ----------
-    camera : RenderCamera
-        The camera.
     samples : int
         Rays of a pixel on the edge of a microimage, rounded up to a power of two.
     seed : int
@@ -329,8 +325,6 @@ def render_board(
 
     Parameters
     ----------
-    camera : RenderCamera
-        The camera.
     plane_mm : float
         The board's z [mm].
     dots : tuple of int

@@ -245,8 +245,6 @@ def render_sources(
 
     Parameters
     ----------
-    camera : RenderCamera
-        The camera.
     points_mm : ndarray, shape (source, 3)
         Centres (x, y, z) in the world [mm].
     counts : ndarray, shape (source,)

@@ -156,8 +156,6 @@ def render_patch(
 
     Parameters
     ----------
-    camera : RenderCamera
-        The camera.
     centre_mm : ndarray, shape (3,)
         Centre of the patch (x, y, z) in the world [mm].
     axes : ndarray, shape (2, 3)

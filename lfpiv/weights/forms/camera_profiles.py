@@ -261,8 +261,6 @@ def _seen_by_parts(
 
     Parameters
     ----------
-    camera : CalibratedCamera
-        The camera.
     models : ndarray, shape (row, column, 38)
         Ray models of the plane's voxels.
     middle_rows : ndarray, shape (part,)

@@ -75,8 +75,6 @@ def count_blocks(
     ----------
     stored : StoredGrid
         The voxels.
-    camera : CalibratedCamera
-        The camera.
     rays : int
         Rays per voxel: a power of 2, at most ``counted_blocks.MOST_RAYS``.
     progress : callable

@@ -48,8 +48,6 @@ class Form(ABC):
 
     Parameters
     ----------
-    rig : Rig
-        The rig.
     names : iterable of str
         Cameras without weights.
     """

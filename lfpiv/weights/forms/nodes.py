@@ -111,8 +111,6 @@ def choose_nodes(
     ----------
     stored : StoredGrid
         The voxels.
-    camera : CalibratedCamera
-        The camera.
     form : {"profiles", "pixels"}
         Form of the weights.
     cuts : tuple of int
@@ -172,8 +170,6 @@ def interpolation_errors(nodes: NodeGrid, sample: Sample, own: list[sparse.csr_a
 
     Parameters
     ----------
-    nodes : NodeGrid
-        The nodes.
     sample : Sample
         The groups of voxels.
     own : list of csr_array
