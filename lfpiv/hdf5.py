@@ -83,26 +83,14 @@ class Disk(FileIO):
             return size or 0
 
     def check(self) -> None:
-        """Raise the first failure.
-
-        Raises
-        ------
-        OSError
-            If a write failed since the file was opened.
-        """
+        """Raise the first OSError of a write since the file was opened."""
         if self._error is not None:
             raise self._error
 
 
 @contextlib.contextmanager
 def written(path: Path) -> Iterator[Disk]:
-    """Yield a new file for HDF5 to write to, and seal it at the end.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    """Yield a new file for HDF5 to write to, and seal it at the end; raise OSError if the file cannot be written."""
     with Disk(path, "w+") as file:
         try:
             yield file

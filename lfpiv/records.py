@@ -86,13 +86,7 @@ def read_json(text: str | bytes) -> Any:
 
 
 def read_object(text: str | bytes) -> dict[str, Any]:
-    """Read JSON text that holds an object.
-
-    Raises
-    ------
-    RecordError
-        If it is something else.
-    """
+    """Read JSON text that holds an object; raise RecordError if it is something else."""
     found = read_json(text)
     if not isinstance(found, dict):
         raise RecordError(f"expected a JSON object, found {_short(found)}")

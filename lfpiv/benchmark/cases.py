@@ -104,13 +104,7 @@ def names() -> tuple[str, ...]:
 
 
 def case_of(name: str) -> Case:
-    """Return a case.
-
-    Raises
-    ------
-    InputError
-        If there is no case of that name.
-    """
+    """Return a case; raise InputError if there is no case of that name."""
     for case in case_list().case:
         if case.name == name:
             return case

@@ -93,13 +93,7 @@ def read_result(path: str | Path, truth: Truth, options: ReadOptions | None = No
 
 
 def result_files(path: Path) -> list[Path]:
-    """Return the files of a result, in order.
-
-    Raises
-    ------
-    InputError
-        If there are none, or a folder has tables beside NetCDF files.
-    """
+    """Return the files of a result, in order; raise InputError if there are none, or tables beside NetCDF files."""
     if path.is_file():
         return [path]
     if not path.is_dir():

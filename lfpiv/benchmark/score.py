@@ -183,13 +183,7 @@ def _costs(fields: Sequence[MeasuredField]) -> dict[str, float]:
 
 
 def chosen_numbers(truth: Truth, pairs: tuple[int, int | None] | None) -> tuple[int, ...]:
-    """Return the numbers of the pairs or instants that are scored.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Return the numbers of the pairs or instants that are scored; raise InputError if there are none."""
     first, last = pair_range(pairs)
     chosen = tuple(one for one in truth.numbers if one >= first and (last is None or one < last))
     if not chosen:

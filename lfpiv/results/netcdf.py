@@ -160,13 +160,7 @@ def _check_voxels(volume: xr.DataArray, grid: Grid) -> None:
 
 
 def check_volume(volume: xr.DataArray) -> None:
-    """Check the form of a volume.
-
-    Raises
-    ------
-    ValueError
-        If it does not lie on axes that increase, or an intensity is no number of 0 or more.
-    """
+    """Check a volume; raise ValueError if its axes do not increase, or an intensity is no number of 0 or more."""
     if volume.dims != AXES:
         raise ValueError(f"volume: expected the dimensions (z, y, x), found {volume.dims}.")
     for axis in AXES:

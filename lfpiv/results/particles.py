@@ -121,13 +121,7 @@ def open_particles(folder: str | Path, *, pairs: tuple[int, int | None] | None =
 
 
 def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) -> dict[int, Path]:
-    """Return the files of the linked particles by pair, in order.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Return the files of the linked particles by pair, in order; raise InputError if there are none."""
     first, last = pair_range(pairs)
     found = {}
     for path in sorted((folder / FOLDER).glob("*.nc")):

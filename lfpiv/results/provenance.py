@@ -178,13 +178,7 @@ def _text(value: Any, name: str) -> str:
 
 
 def require_name(path: Path, attributes: Mapping[str, Any]) -> None:
-    """Refuse a file that was written under another name, such as another pair's.
-
-    Raises
-    ------
-    DamagedFile
-        If the attributes of the file name another one.
-    """
+    """Raise DamagedFile for a file that was written under another name, such as another pair's."""
     if (named := attributes.get("file", path.name)) != path.name:
         raise DamagedFile(path, f"it is {str(named)[:80]} under another name")
 
@@ -209,11 +203,5 @@ def background_figures(path: Path) -> tuple[Mapping[str, Mapping[str, float | No
 
 
 def stored_warnings(attributes: Mapping[str, Any]) -> tuple[Warning, ...]:
-    """Read the warnings in the attributes of a file.
-
-    Raises
-    ------
-    RecordError
-        If they are no list of warnings.
-    """
+    """Read the warnings in the attributes of a file; raise RecordError if they are no list of warnings."""
     return warn.from_list(read_json(attributes.get("warnings", "[]")))

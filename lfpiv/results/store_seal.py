@@ -83,13 +83,7 @@ class _Array:
 
 
 def verify_netcdf(path: Path) -> None:
-    """Verify a NetCDF store.
-
-    Raises
-    ------
-    DamagedFile
-        If its bytes are not those that were written, as far as they are read.
-    """
+    """Verify a NetCDF store; raise DamagedFile if bytes that are read are not those that were written."""
     if os.path.getsize(path) <= WHOLE_BYTES:
         hdf5.verify(path)
     else:
@@ -98,13 +92,7 @@ def verify_netcdf(path: Path) -> None:
 
 
 def zarr_attributes(path: Path) -> dict[str, Any]:
-    """Read the attributes of a Zarr store.
-
-    Raises
-    ------
-    DamagedFile
-        If they are missing or have another form.
-    """
+    """Read the attributes of a Zarr store; raise DamagedFile if they are missing or have another form."""
     return _read(path, METADATA, _Group).attributes
 
 
@@ -131,13 +119,7 @@ def check_zarr(path: Path) -> None:
 
 
 def verify_zarr(path: Path) -> None:
-    """Verify a Zarr store, whose form was checked.
-
-    Raises
-    ------
-    DamagedFile
-        If its files are not those that were written, as far as they are read.
-    """
+    """Verify a Zarr store, whose form was checked; raise DamagedFile if files that are read are not as written."""
     stated = zarr_attributes(path)
     whole = sum(size for _, size in _files(path)) <= WHOLE_BYTES
     if any(stated.get(name) != found for name, found in zarr_digests(path, whole=whole).items()):

@@ -318,13 +318,7 @@ class _Figures:
 
 
 def load(path: Path, calibration: Calibration) -> Background:
-    """Read a background that `prepare` stored for the cameras of a calibration.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, or of other cameras.
-    """
+    """Read a background that `prepare` stored; raise InputError if it is missing, damaged, or of other cameras."""
     try:
         with hdf5.opened(path) as file:
             figures = validate(_Figures, read_object(file.attrs["figures"]))

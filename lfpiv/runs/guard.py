@@ -56,13 +56,7 @@ class Guard:
 
     @classmethod
     def from_json(cls, stored: Any) -> Guard:
-        """Read the form that a file stores.
-
-        Raises
-        ------
-        RecordError
-            If it has another form, or its numbers are out of range.
-        """
+        """Read the form that a file stores; raise RecordError if it has another form, or numbers out of range."""
         found = validate(cls, stored)
         counts = [count for pair in found.layers for count in pair]
         lengths = [value for face in found.faces for value in (face.reach_mm, face.share, face.guard_mm)]

@@ -57,13 +57,7 @@ SETTINGS = {
 
 
 def import_distributed(key: str) -> Any:
-    """Import Dask's package `distributed`.
-
-    Raises
-    ------
-    InputError
-        If it is not installed; `key` is the option that needs it.
-    """
+    """Import Dask's `distributed`; raise InputError if it is not installed; `key` is the option that needs it."""
     try:
         import distributed
     except ImportError:

@@ -95,13 +95,7 @@ class SelfCalibrationFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> SelfCalibrationFigures:
-        """Read the form that a file stores.
-
-        Raises
-        ------
-        RecordError
-            If it has another form.
-        """
+        """Read the form that a file stores; raise RecordError if it has another form."""
         return validate(cls, stored)
 
 

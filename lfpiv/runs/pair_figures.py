@@ -144,13 +144,7 @@ class PairFigures:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> PairFigures:
-        """Read the form that a file stores.
-
-        Raises
-        ------
-        RecordError
-            If it has another form.
-        """
+        """Read the form that a file stores; raise RecordError if it has another form."""
         if not isinstance(stored, Mapping):
             raise RecordError("expected the figures of a pair")
         warnings = warn.from_list(stored.get("warnings", []))

@@ -101,13 +101,7 @@ class Reconstructor:
         return SequenceSolver(self.solver.smart, correlation)
 
     def pair(self, light: Sequence[FrameLight], progress: StepProgress) -> tuple[FrameVolume, FrameVolume]:
-        """Reconstruct both frames of an image pair together.
-
-        Raises
-        ------
-        InputError
-            If their images cannot be reconstructed.
-        """
+        """Reconstruct both frames of a pair together; raise InputError if their images cannot be reconstructed."""
         start = time.perf_counter()
         solver = self.solver
         try:

@@ -52,13 +52,7 @@ class Refinement:
 
     @classmethod
     def from_json(cls, stored: Any) -> Refinement:
-        """Read the form that a file stores.
-
-        Raises
-        ------
-        RecordError
-            If it has another form, or its numbers are out of range.
-        """
+        """Read the form that a file stores; raise RecordError if it has another form, or numbers out of range."""
         found = validate(cls, stored)
         size = 0.0 if found.size_voxel is None else found.size_voxel
         if not (math.isfinite(size) and size >= 0 and 1 <= found.factor <= found.demanded <= LARGEST):

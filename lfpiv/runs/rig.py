@@ -52,13 +52,7 @@ class Prepared:
 
 
 def load_calibration(run: Run) -> Calibrated:
-    """Load the calibration in the folder.
-
-    Raises
-    ------
-    InputError
-        If there is none that fits the experiment.
-    """
+    """Load the calibration in the folder; raise InputError if there is none that fits the experiment."""
     from lfpiv.calibration.camera import load_calibration
 
     path = run.folder.calibration

@@ -209,13 +209,7 @@ class LensSystem:
 
     @functools.cached_property
     def ray_polynomial(self) -> np.ndarray:
-        """Polynomial of the rays, in the form of `real_optics.lens_offsets`.
-
-        Raises
-        ------
-        ValueError
-            If a ray of pupil and sensor does not pass.
-        """
+        """Polynomial of the rays for `real_optics.lens_offsets`; raise ValueError if a ray does not pass."""
         optics = self.optics
         along, rings, turns = FITTED
         far = FIELD * self.field_mm * np.sin(np.pi / 2 * (np.arange(along) + 0.5) / along)  # dense at the edge
@@ -318,13 +312,7 @@ def _read_zemax(path: Path) -> tuple[LensSurface, ...]:
 
 
 def surfaces_of(optic: Any) -> tuple[LensSurface, ...]:
-    """Return the surfaces of an optiland lens, between its object and its image.
-
-    Raises
-    ------
-    ValueError
-        If a surface is no sphere.
-    """
+    """Return the surfaces of an optiland lens between object and image; raise ValueError if a surface is no sphere."""
     group, wavelength, found = optic.surfaces, optic.primary_wavelength, []
     places = np.ravel(group.positions)
     for number in range(1, group.num_surfaces - 1):

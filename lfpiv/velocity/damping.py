@@ -183,13 +183,7 @@ class Damping:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Damping:
-        """Read the form that a file stores.
-
-        Raises
-        ------
-        RecordError
-            If it has another form.
-        """
+        """Read the form that a file stores; raise RecordError if it has another form."""
         found = validate(_Stored, stored)
         if set(found.axes) != set(AXES):
             raise RecordError(f"expected the axes x, y, z, found {', '.join(found.axes)}")

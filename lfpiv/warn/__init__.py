@@ -139,24 +139,12 @@ def to_text(warnings: Iterable[Warning]) -> str:
 
 
 def from_text(text: str) -> tuple[Warning, ...]:
-    """Read the JSON text that an attribute of a file stores.
-
-    Raises
-    ------
-    RecordError
-        If it is no list of warnings.
-    """
+    """Read the JSON text that an attribute of a file stores; raise RecordError if it is no list of warnings."""
     return from_list(records.read_json(text))
 
 
 def from_list(stored: Any) -> tuple[Warning, ...]:
-    """Read the list of warnings that a record holds.
-
-    Raises
-    ------
-    RecordError
-        If it is no list of warnings.
-    """
+    """Read the list of warnings that a record holds; raise RecordError if it is no list of warnings."""
     if not isinstance(stored, list):
         raise RecordError("expected a list of warnings")
     return tuple(map(Warning.from_json, stored))
