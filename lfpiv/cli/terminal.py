@@ -79,7 +79,7 @@ class Output:
                 with _bars(console) as update:
                     yield update
             else:
-                yield _recorded(_log_lines())
+                yield _log_lines()
         finally:
             for logger in loggers:
                 logger.removeHandler(handler)
@@ -128,10 +128,12 @@ def _bars(console: Console) -> Iterator[Progress]:
 
 
 def _log_lines() -> Progress:
+    """Return a progress that writes log lines, and is recorded for the studio."""
     began: dict[str, tuple[float, float]] = {}  # time and fraction of the first report of each step
     last: dict[str, float] = {}  # time of its last log line
 
     def update(step: str, fraction: float) -> None:
+        record(step, fraction)
         now = time.monotonic()
         if step not in last or (fraction < 1 and now - last[step] >= LOG_EVERY_S):
             start, done = began.setdefault(step, (now, fraction))
@@ -141,16 +143,6 @@ def _log_lines() -> Progress:
             last[step] = now
 
     return update
-
-
-def _recorded(update: Progress) -> Progress:
-    """Return a progress that is also recorded for the studio."""
-
-    def both(step: str, fraction: float) -> None:
-        update(step, fraction)
-        record(step, fraction)
-
-    return both
 
 
 def parse_pairs(text: str) -> tuple[int, int | None]:

@@ -240,7 +240,7 @@ def _grid(path: Path, volume: ExperimentVolume, cameras: int) -> Grid:
             f"{guarded.size:.1e}. Raise volume.voxel_mm, or shrink volume.size_mm or volume.guard_mm."
         )
     needed = (LEAST_BYTES_PER_VOXEL + LEAST_BYTES_PER_CAMERA * cameras) * guarded.size
-    machine = _memory_of_machine()
+    machine = memory_of_machine()
     if (volume.mask is not None or volume.solid) and needed > machine:
         raise InputError(
             f"{path}: volume: expected voxels that fit into memory, found {guarded.size:.1e}, guard layers included, "
@@ -250,7 +250,7 @@ def _grid(path: Path, volume: ExperimentVolume, cameras: int) -> Grid:
     return grid
 
 
-def _memory_of_machine() -> int:
+def memory_of_machine() -> int:
     """Return the memory of this machine [byte]."""
     if not hasattr(os, "sysconf"):
         return sys.maxsize

@@ -180,7 +180,7 @@ def lattice_pitch(basis: np.ndarray, layout: str) -> float:
 
 def _standard_basis(lag: np.ndarray, layout: str) -> np.ndarray:
     """Return the lattice vectors in the order of `LensArray.basis_px`, from one lattice vector."""
-    turn, lowest = (60.0, -15.0) if layout == "hexagonal" else (90.0, -45.0)
+    turn, lowest = cell_angle_deg(layout), -15.0 if layout == "hexagonal" else -45.0
     angle = math.degrees(math.atan2(lag[1], lag[0]))
     angles = np.radians(lowest + (angle - lowest) % turn + np.array([0, turn]))
     return np.hypot(*lag) * np.stack([np.cos(angles), np.sin(angles)], axis=1)

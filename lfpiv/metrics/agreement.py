@@ -11,8 +11,6 @@ import numpy as np
 
 LEAST_DEVIATION = 0.1
 """Least standard deviation of the truth for which its slope is stated [unit of the truth]."""
-WITHIN_ONE, WITHIN_TWO = 0.6827, 0.9545
-"""Parts of normal errors within one and two standard deviations."""
 _MEDIAN_OF_NORMAL = 0.6745  # median of |z| for a normal z
 
 

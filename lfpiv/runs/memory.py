@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
-from lfpiv.experiment.opening import LEAST_BYTES_PER_CAMERA, LEAST_BYTES_PER_VOXEL
+from lfpiv.experiment.opening import LEAST_BYTES_PER_CAMERA, LEAST_BYTES_PER_VOXEL, memory_of_machine
 from lfpiv.experiment.segments import REACH
 from lfpiv.files import MIB
 
@@ -113,7 +112,7 @@ def available_bytes() -> int:
     """Return the memory this process may take [byte]: the free memory, limited by its control groups."""
     free = meminfo("MemAvailable")
     if free is None:
-        free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else sys.maxsize
+        free = memory_of_machine()
     return max(0, min([free, *_left_in_groups()]))
 
 

@@ -155,7 +155,7 @@ class StrayLight(Table):
         return np.maximum(0, 1 + self.variation * field)
 
 
-class FrameLight(NamedTuple):
+class PairLight(NamedTuple):
     """Light of one pair."""
 
     power: np.ndarray
@@ -164,12 +164,12 @@ class FrameLight(NamedTuple):
     """Brightness of each particle in each camera and frame, power included, shape (cameras, 2, particle)."""
 
 
-def frame_light(
+def pair_light(
     sheet: Sheet | None,
     brightness: np.ndarray,
     at_frames: tuple[np.ndarray, np.ndarray],
     rng: np.random.Generator,
-) -> FrameLight:
+) -> PairLight:
     """Return the brightness of the particles of one pair in each camera and frame.
 
     Parameters
@@ -184,10 +184,10 @@ def frame_light(
         Generator of the pulses' power.
     """
     if sheet is None:
-        return FrameLight(np.ones(2), np.repeat(brightness[:, None], 2, axis=1))
+        return PairLight(np.ones(2), np.repeat(brightness[:, None], 2, axis=1))
     power = sheet.powers(rng)
     lit = np.stack([power[pulse] * sheet.light(at, pulse) for pulse, at in enumerate(at_frames)])
-    return FrameLight(power, brightness[:, None] * lit)
+    return PairLight(power, brightness[:, None] * lit)
 
 
 def pulse_light(
@@ -195,7 +195,7 @@ def pulse_light(
 ) -> tuple[float, np.ndarray]:
     """Return the power of a pulse, and the brightness of particles in each camera, shape (cameras, particle).
 
-    Parameters as of `frame_light`; `at_mm` (particle, 3) are the positions in the light of the pulse, 0 or 1 [mm].
+    Parameters as of `pair_light`; `at_mm` (particle, 3) are the positions in the light of the pulse, 0 or 1 [mm].
     """
     if sheet is None:
         return 1.0, brightness

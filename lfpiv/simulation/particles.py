@@ -9,7 +9,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.simulation.flows import Tracers
-from lfpiv.simulation.light import Brightness, frame_light
+from lfpiv.simulation.light import Brightness, pair_light
 from lfpiv.simulation.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ def lit_particles(scene: Scene, pair: int) -> LitParticles:
     """Return the particles of one image pair with the light of its two pulses; parameters as of `place_particles`."""
     placed = place_particles(scene, pair)
     rng = np.random.default_rng([scene.seed, 23, pair])
-    light = frame_light(
+    light = pair_light(
         scene.sheet, placed.intensity * placed.camera_factor, (placed.at_frame("a"), placed.at_frame("b")), rng
     )
     return LitParticles(placed, light.power, light.brightness)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -27,7 +27,11 @@ from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, Camera, pack_optics
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
+    from lfpiv.weights.forms.node_grid import NodeGrid
+    from lfpiv.weights.stored_grid import StoredGrid
 
+Places: TypeAlias = "StoredGrid | NodeGrid"
+"""Voxels, or nodes between them, whose weights are stored."""
 Cuts = tuple[int, int, int]
 """Number of equal parts of a voxel along x, y, z. The footprints of the parts are integrated separately and added."""
 
@@ -110,32 +114,6 @@ class Growing:
         """Return all entries taken."""
         self._array.resize(self._used, refcheck=False)
         return self._array
-
-
-class Places(Protocol):
-    """Voxels, or nodes between them, whose weights are stored."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Numbers along their axes in memory, outermost first."""
-
-    @property
-    def size(self) -> int:
-        """Their number."""
-
-    @property
-    def volume_shape(self) -> tuple[int, int, int]:
-        """Voxels of the volume (z, y, x)."""
-
-    @property
-    def voxel_mm(self) -> float:
-        """Edge of the cube whose weights are stored [mm]."""
-
-    def centres_mm(self, index: np.ndarray) -> np.ndarray:
-        """Return the cubes' centres (x, y, z) [mm] by their index, shape (cube, 3)."""
-
-    def models(self, camera: CalibratedCamera, form: str = "pixels") -> Iterator[np.ndarray]:
-        """Yield the ray models, plane by plane of the outermost axis."""
 
 
 def footprint_blocks(

@@ -110,10 +110,10 @@ def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets
     image = empty(comparison.size)
     pixel = comparison.projector.map.rays.pixel
     if runtime.device().form == "cpu":
-        counts, gain, place, out_of = (to_host(one) for one in (comparison.image, comparison.gain, pixel, image))
+        counts, gain, place, logarithm = (to_host(array) for array in (comparison.image, comparison.gain, pixel, image))
 
         def fill(_: int, first: int, last: int) -> None:
-            out_of[place[first:last]] = gain[first:last] * np.log1p(counts[first:last] / floor)
+            logarithm[place[first:last]] = gain[first:last] * np.log1p(counts[first:last] / floor)
 
         runtime.run_chunks(pixel.size, fill, chunks=parts_of(pixel.size, FEWEST_PIXELS))
     else:

@@ -180,7 +180,8 @@ class TiledProjector:
         matrix.profiles = blocks.form == "profiles"
         matrix.pitch = self._pitch
         if matrix.profiles:
-            matrix.sectors = profile_sectors(blocks)
+            highest = int(blocks.height.max(initial=0)) + int(blocks.width.max(initial=0))
+            matrix.sectors = -(-highest // SECTOR)  # of each block
             starts, sectors = np.zeros(0, np.int64), matrix.sectors * len(blocks.ray)
         else:
             sizes = -(-blocks.height.astype(np.int64) * blocks.width // SECTOR)
@@ -204,7 +205,7 @@ class TiledProjector:
 
     def _tiles(self, blocks: Blocks, matrix: TiledMatrix, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the arrays of the tiles that are lit and of their entries."""
-        per_edge = tiles_per_edge(self._edge)
+        per_edge = -(-self._edge // TILE)  # tiles along a microimage
         side = -(-self._edge // per_edge)
         count = np.zeros(-(-self._rows // self._edge) * per_edge**2, np.int64)
         tile_set = np.zeros(len(count), np.uint8)
@@ -251,16 +252,6 @@ class TiledProjector:
         inputs = [self.matrix, to_device(placed)]
         launch(Call(_count_lit, len(count), inputs, [count], inner=lanes_of_warp()))
         return count
-
-
-def profile_sectors(blocks: Blocks) -> int:
-    """Return the sectors of each block of profiles: those of the highest."""
-    return -(-(int(blocks.height.max(initial=0)) + int(blocks.width.max(initial=0))) // SECTOR)
-
-
-def tiles_per_edge(edge: int) -> int:
-    """Return the number of tiles along a microimage's edge."""
-    return -(-edge // TILE)
 
 
 def device_bytes(form: str, voxels: int, blocks: int, values: int, *, edge: int) -> int:
