@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 from scipy.stats import qmc
+from support import ray_twins
 from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH
-from support.simulated_cameras import SMALL_SCENE, camera, land, lens_gain, points, relative_difference, snell
+from support.simulated_cameras import SMALL_SCENE, camera, points, relative_difference, snell
 
 import lfpiv
 from lfpiv.errors import InputError
@@ -44,7 +45,7 @@ EVEN = {"vignetting": 0, "lens_gain_sd": 0}
 
 
 def rig(name, **changes):
-    return camera("ideal", **({"nominal_angle_deg": 45} | RIGS[name] | changes))
+    return camera("ideal", **({"nominal_angle_deg": 45} | RIGS.get(name, {}) | changes))
 
 
 def pupil_points(count, radius=12.5, seed=3):
@@ -96,7 +97,7 @@ def test_true_rays_obey_snell_s_law(name):
     assert np.abs(found - true_mapping(without)(at, pupil)).max() > 0.02  # the windows matter: a fifth of a microlens
 
 
-@pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize("name", [*RIGS, "ideal"])
 def test_rays_are_reversible(name):
     """A ray from a point to the array, and back to the plane of the point: iterated one way, explicit the other."""
     scene_camera = rig(name)
@@ -174,19 +175,6 @@ def test_aberrations_are_the_gradient_of_one_wave_aberration():
     assert np.abs(slopes[0][:, 1] - slopes[1][:, 0]).max() < 1e-10  # differences of 1e-15 mm over 1e-4 mm
 
 
-def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`: true rays in float64, added up on the sensor by definition."""
-    image, mapping = 0, true_mapping(scene_camera)
-    angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
-    for centre, count, (turn, roll) in zip(centres, counts, angles, strict=True):
-        pupil = 12.5 * rays[:, :2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-        unit = rays[:, 2:].astype(float)
-        unit[:, :2] = unit[:, :2] @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
-        weight = np.full(len(rays), count / len(rays))
-        image = image + land(scene_camera, renderer, mapping(centre + extent * unit, pupil), pupil, weight)
-    return image
-
-
 @pytest.mark.parametrize("name", RIGS)
 def test_sources_seen_through_real_optics_equal_their_twin(device, name):
     scene_camera = rig(name)
@@ -194,7 +182,7 @@ def test_sources_seen_through_real_optics_equal_their_twin(device, name):
     centres, counts = points(10), np.full(10, 1e5)
     rays = render.ray_table(4096, "ball", 0)
     found = render.render_sources(renderer, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
-    expected = sources_twin(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
+    expected = ray_twins.sources(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
     assert expected.sum() > 0.1 * counts.sum()
     assert relative_difference(found, expected) < MOVED_RAYS
     plain = render_camera(camera("ideal", nominal_angle_deg=scene_camera.nominal_angle_deg))
@@ -209,32 +197,10 @@ def test_a_board_seen_through_real_optics_equals_its_twin(device, name):
     weak = {key: 0.05 for key in LENS if key.endswith("pitch")} | {"spherical_pitch": 0.6}  # the field is tiny
     changes = {"sensor_width_px": 40, "sensor_height_px": 30, "true_offset_mm": (0, 0, 0.15)}
     scene_camera = rig(name, **changes | ({"aberrations": weak} if name == "all" else {}))
-    optics, lattice, renderer = scene_camera.optics, scene_camera.lattice, render_camera(scene_camera)
     board, samples = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}, 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
-    cell = table[:, 2:] @ lattice.basis_mm
-    cell -= lattice.centres_mm(lattice.nearest(cell + lattice.origin_mm)) - lattice.origin_mm
-    scale, (rows, columns) = optics.sensor_per_pupil, optics.sensor_shape
-    expected = np.zeros((rows, columns))
-    for row, column in np.ndindex(rows, columns):
-        middle = (np.array([column, row]) + 0.5 - np.array([columns, rows]) / 2) * optics.pixel_mm
-        for step in np.ndindex(3, 3):
-            index = lattice.nearest(middle / (1 + scale)) + step - [1, 1]
-            lens = lattice.centres_mm(index)
-            array = lens + cell
-            pupil = array - (middle + table[:, :2] * optics.pixel_mm - lens) / scale
-            lit = (pupil**2).sum(1) < optics.pupil_radius_mm**2
-            if not lit.any():
-                continue
-            start, direction = real_optics.object_lines(
-                array, pupil, optics.object_distance_mm, optics.image_distance_mm, renderer.plates, renderer.aberrations
-            )
-            start, direction = start @ renderer.rotation + renderer.offset_mm, direction @ renderer.rotation
-            x, y, _ = (start + ((0.15 - start[:, 2]) / direction[:, 2])[:, None] * direction).T
-            off = np.hypot(
-                *(np.abs(a[:, None] - (np.arange(n) - (n - 1) / 2) * 0.12).min(1) for a, n in ((x, 3), (y, 2)))
-            )
-            expected[row, column] += (lit & (off < 0.04)).mean() * lens_gain(renderer, index[None])[0]
+    renderer = render_camera(scene_camera)
+    expected = ray_twins.board(scene_camera, renderer, 0.15, **board, table=table)
     found = collect.render_board(renderer, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples

@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter
 from scipy.stats import qmc
+from support import ray_twins
 from support.simulated_cameras import MONTE_CARLO, RIGS, ROUNDING, camera, land, points, relative_difference
 
 from lfpiv.simulation.scene import Noise, SceneCamera, true_mapping
@@ -22,23 +23,6 @@ MOVED_RAYS = (
     2e-3  # share of the light in other pixels: float32 places rays to 2e-4 px, pixel edges pass each lens often
 )
 EDGE_SAMPLES = 2.5  # rays of one pixel that float32 may put on the other side of an edge
-
-
-def sources_twin(scene_camera, renderer, centres, counts, extent, rays, rng):
-    """Twin of `render_sources`, ray by ray in float64, by DRT: s = k u - m x_c."""
-    optics, image = scene_camera.optics, 0
-    f, si, so = optics.focal_length_mm, optics.image_distance_mm, optics.object_distance_mm
-    angles = rng.uniform(0, 2 * np.pi, (len(centres), 2))
-    for centre, count, (turn, roll) in zip(centres, counts, angles, strict=True):
-        pupil = optics.pupil_radius_mm * rays[:, :2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-        unit = rays[:, 2:].astype(float)
-        unit[:, :2] = unit[:, :2] @ [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
-        x, y, z = ((centre + extent * unit - scene_camera.true_offset_mm) @ scene_camera.rotation.T).T
-        d = so - z
-        k, m = 1 - si / f + si / d, si / d
-        s_t = k[:, None] * pupil - m[:, None] * np.stack([x, y], 1)
-        image = image + land(scene_camera, renderer, s_t, pupil, np.full(len(rays), count / len(rays)))
-    return image
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -76,7 +60,7 @@ def test_sources_equal_their_twin(device, rig, shape):
     centres, counts = points(12), np.random.default_rng(1).uniform(5e4, 2e5, 12)
     rays = render.ray_table(4096, shape, 0)
     found = render.render_sources(renderer, centres, counts, 0.03, rays, rng=np.random.default_rng(2))
-    expected = sources_twin(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
+    expected = ray_twins.sources(scene_camera, renderer, centres, counts, 0.03, rays, np.random.default_rng(2))
     assert expected.sum() > 0.1 * counts.sum()  # the sensor sees them
     assert relative_difference(found, expected) < MOVED_RAYS
 
@@ -104,40 +88,13 @@ def test_white_equals_rays_of_uniform_light(device, rig):
     assert np.abs(score).max() < 1.5 * MONTE_CARLO
 
 
-def board_twin(scene_camera, plane, dots, spacing, diameter, table):
-    """Twin of `render_board` (bright dots): trace the light of each pixel back to the board."""
-    optics, lattice = scene_camera.optics, scene_camera.lattice
-    scale = optics.microlens_focal_length_mm / optics.image_distance_mm
-    rows, columns = optics.sensor_shape
-    image = np.zeros((rows, columns))
-    rotation, offset = scene_camera.rotation, np.asarray(scene_camera.true_offset_mm)
-    grid = [(np.arange(n) - (n - 1) / 2) * spacing for n in dots]
-    cell = table[:, 2:] @ lattice.basis_mm
-    cell -= lattice.centres_mm(lattice.nearest(cell + lattice.origin_mm)) - lattice.origin_mm  # into a lens's own cell
-    for row, column in np.ndindex(rows, columns):
-        middle = (np.array([column, row]) + 0.5 - np.array([columns, rows]) / 2) * optics.pixel_mm
-        for step in np.ndindex(3, 3):
-            lens = lattice.centres_mm(lattice.nearest(middle / (1 + scale)) + step - [1, 1])
-            s_t = lens + cell
-            pupil = s_t - (middle + table[:, :2] * optics.pixel_mm - lens) / scale
-            open_ = (pupil**2).sum(1) < optics.pupil_radius_mm**2
-            if open_.any():
-                start = np.column_stack([pupil, np.full(len(table), optics.object_distance_mm)])
-                end = np.column_stack([-s_t * optics.object_distance_mm / optics.image_distance_mm, 0 * pupil[:, 0]])
-                start, end = start @ rotation + offset, end @ rotation + offset  # lens point, focus point in the world
-                x, y, _ = (start + ((plane - start[:, 2]) / (end - start)[:, 2])[:, None] * (end - start)).T
-                off = np.hypot(np.abs(x[:, None] - grid[0]).min(1), np.abs(y[:, None] - grid[1]).min(1))
-                image[row, column] += (open_ & (off < diameter / 2)).mean()
-    return image
-
-
 @pytest.mark.parametrize("rig", ["misaligned", "hexagonal", "overlapping"])
 def test_board_equals_its_twin(device, rig):
     scene_camera = camera(rig, sensor_width_px=44, sensor_height_px=32, vignetting=0, lens_gain_sd=0)
     board = {"dots": (3, 2), "spacing_mm": 0.12, "dot_diameter_mm": 0.08}
     renderer, samples = render_camera(scene_camera), 64
     table = qmc.Sobol(4, scramble=True, seed=np.random.default_rng(3)).random(samples) - 0.5
-    expected = board_twin(scene_camera, 0.15, *board.values(), table)
+    expected = ray_twins.board(scene_camera, renderer, 0.15, **board, table=table)
     found = collect.render_board(renderer, 0.15, **board, dot_light=1, board_light=0, samples=samples, seed=3)
     assert expected.max() > 0.3
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from scipy.stats import qmc
+from support.ray_twins import open_rays, pixel_rays, plane_light
 from support.simulated_cameras import MONTE_CARLO, camera, lens_gain, small_scene
 
 from lfpiv.simulation.camera_images import static_light, white_image
 from lfpiv.simulation.scene import true_mapping
 from lfpiv.simulation.simulator import image_area, place_particles, render_camera, simulate
 from lfpiv.simulation.surfaces import Surface
-from lfpiv_kernels.rendering import collect, real_optics, render, surfaces
+from lfpiv_kernels.rendering import collect, render, surfaces
 
 EDGE_SAMPLES = 2.5  # rays of one pixel that float32 may put on the other side of an edge
 GLASS = {"point_mm": (0, 0, 20), "normal": (0.1, 0, 1), "thickness_mm": 5.0, "index": 1.5}
@@ -28,52 +29,20 @@ def rig(name, **changes):
     return camera(base, **({"nominal_angle_deg": 30} | RIGS[name] | changes))
 
 
-def pixel_rays(scene_camera, table):
-    """Yield lens (i, j), (s, t) and (u, v) of the rays of all pixels through each of 3 x 3 lenses, by Eq. 9.
+def patch_light(patch):
+    """Return the light of a patch at places in its plane."""
 
-    Arrays have shape (row, column, ray, 2).
-    """
-    optics, lattice, drift = scene_camera.optics, scene_camera.lattice, scene_camera.faults[:2]
-    scale = optics.microlens_focal_length_mm / optics.image_distance_mm
-    rows, columns = optics.sensor_shape
-    row, column = np.indices((rows, columns))
-    middle = (np.stack([column, row], axis=-1) + 0.5 - np.array([columns, rows]) / 2) * optics.pixel_mm
-    cell = table[:, 2:] @ lattice.basis_mm
-    cell -= lattice.centres_mm(lattice.nearest(cell + lattice.origin_mm)) - lattice.origin_mm  # into a lens's own cell
-    near = middle / (1 + scale)
-    home = lattice.nearest(2 * near / (1 + np.sqrt(1 + 4 * drift * near)))
-    for step in np.ndindex(3, 3):
-        index = home + np.array(step) - [1, 1]
-        regular = lattice.centres_mm(index)
-        lens = (regular + drift * regular**2)[:, :, None]
-        s_t = lens + cell
-        yield index, s_t, s_t - (middle[:, :, None] + table[:, :2] * optics.pixel_mm - lens) / scale
-
-
-def open_rays(scene_camera, s_t, pupil):
-    """Return which rays pass both apertures."""
-    radius, eye = scene_camera.optics.pupil_radius_mm, scene_camera.faults[2]
-    return ((pupil**2).sum(-1) < radius**2) & (((pupil - eye * s_t) ** 2).sum(-1) < radius**2)
-
-
-def patch_twin(scene_camera, renderer, patch, table):
-    """Twin of `render_patch`: trace the rays of each pixel back to the plane."""
-    optics, axes, image = scene_camera.optics, patch.axes, 0
-    scales, normal = (optics.object_distance_mm, optics.image_distance_mm), np.cross(*axes)
-    for index, s_t, pupil in pixel_rays(scene_camera, table):
-        passing, light = open_rays(scene_camera, s_t, pupil), np.zeros(s_t.shape[:-1])
-        start, direction = real_optics.object_lines(
-            s_t[passing], pupil[passing], *scales, renderer.plates, renderer.aberrations
+    def light(places):
+        arms = (places - patch.centre_mm) @ patch.axes.T
+        return np.prod(
+            [
+                np.exp(-0.5 * (distance / half) ** 2) if edge == "gaussian" else np.abs(distance) < half
+                for distance, half, edge in zip(arms.T, patch.half_mm, patch.edges, strict=True)
+            ],
+            axis=0,
         )
-        start, direction = start @ renderer.rotation + renderer.offset_mm, direction @ renderer.rotation
-        along = ((patch.centre_mm - start) @ normal) / (direction @ normal)
-        place = (start + along[:, None] * direction - patch.centre_mm) @ axes.T
-        light[passing] = 1
-        for distance, half, edge in zip(place.T, patch.half_mm, patch.edges, strict=True):
-            light[passing] *= np.exp(-0.5 * (distance / half) ** 2) if edge == "gaussian" else np.abs(distance) < half
-        gain = lens_gain(renderer, index.reshape(-1, 2)).reshape(index.shape[:-1])
-        image = image + gain * light.mean(axis=-1)
-    return image
+
+    return light
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -94,7 +63,7 @@ def test_patch_equals_its_twin(device, name):
     found = surfaces.render_patch(
         renderer, np.asarray(patch.centre_mm), patch.axes, patch.half_mm, gaussian, samples=samples, seed=3
     )
-    expected = patch_twin(scene_camera, renderer, patch, table)
+    expected = plane_light(scene_camera, renderer, table, (patch.centre_mm, np.cross(*patch.axes)), patch_light(patch))
     assert expected.max() > 0.2 and (expected < 0.01).mean() > 0.1
     assert np.abs(found - expected).max() <= EDGE_SAMPLES / samples
     assert (np.abs(found - expected) < 1e-4).mean() > 0.95
