@@ -55,10 +55,6 @@ def footprint(model, *, optics, lattice, frame, rectangles, local=False):
     local : bool
         Take each pixel's slope for its offset in place of the slope at the middle of what the lens sees. Smears follow
         from the middle.
-
-    Returns
-    -------
-    ndarray, shape (rows, columns), float64
     """
     model = np.asarray(model, float)
     r, pixel, radius = optics.sensor_per_pupil, optics.pixel_mm, optics.pupil_radius_mm

@@ -58,16 +58,12 @@ class Network:
         return (self.weights[0].shape[0], *(weight.shape[1] for weight in self.weights))
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Evaluate the network, Eqs. 6-7.
+        """Evaluate the network, Eqs. 6-7, shape (n, m), float64.
 
         Parameters
         ----------
         points : array_like, shape (n, d)
             Inputs in their own unit.
-
-        Returns
-        -------
-        ndarray, shape (n, m), float64
 
         Raises
         ------

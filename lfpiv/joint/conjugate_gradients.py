@@ -29,10 +29,6 @@ def conjugate_gradients(
         Share of the first squared residual at which the steps end.
     inverse : ndarray or float
         Diagonal preconditioner.
-
-    Returns
-    -------
-    ndarray, shape of `rest`
     """
     found, scaled = np.zeros_like(rest), inverse * rest
     way, square = scaled.copy(), float((rest * scaled).sum())

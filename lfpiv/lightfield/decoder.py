@@ -133,17 +133,13 @@ class LightFieldDecoder:
         return _background(_checked("image", image, self.optics), self.gaps)
 
     def shrunk_gain(self, response_share: float) -> np.ndarray:
-        """Return the gain with a part of the white image's deviation from its smooth part.
+        """Return the gain with a part of the white image's deviation from its smooth part, float32.
 
         Parameters
         ----------
         response_share : float
             Part of that deviation that is pixel response, the rest being noise. 1 gives `gain`, 0 gives `smooth_gain`.
             The calibration board gives the best value.
-
-        Returns
-        -------
-        ndarray, shape (rows, columns), float32
         """
         return self.smooth_gain + np.float32(response_share) * (self.gain - self.smooth_gain)
 

@@ -72,7 +72,7 @@ def whole_microimages(shape: tuple[int, ...], origin: np.ndarray, basis: np.ndar
 
 
 def cut_patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray:
-    """Sample the blurred image at whole pixels from each centre.
+    """Sample the blurred image at whole pixels from each centre, shape (lens, 2 half + 1, 2 half + 1), float32.
 
     The blur is centred on the sub-pixel centre, so that it interpolates, too.
 
@@ -84,10 +84,6 @@ def cut_patches(image: np.ndarray, centres: np.ndarray, half: int) -> np.ndarray
         Expected centres (column, row) [pixel].
     half : int
         Half width of a patch [pixel].
-
-    Returns
-    -------
-    ndarray, shape (lens, 2 half + 1, 2 half + 1), float32
     """
     tap = np.arange(-BLUR_REACH_PX, BLUR_REACH_PX + 1)
     nearest = np.rint(centres).astype(int)

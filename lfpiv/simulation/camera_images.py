@@ -276,7 +276,7 @@ def expose(
     sensor: Sensor | None = None,
     pattern: SensorPattern | None = None,
 ) -> np.ndarray:
-    """Turn light into a stored image: blurred, with noise, in whole counts, flipped as the camera does.
+    """Turn light into a stored image, uint16: blurred, with noise, in whole counts, flipped as the camera does.
 
     Parameters
     ----------
@@ -292,10 +292,6 @@ def expose(
         Range of the sensor; default: 12 bits.
     pattern : SensorPattern, optional
         Fixed pattern; default: none.
-
-    Returns
-    -------
-    ndarray of uint16, shape (rows, columns)
     """
     sensor = sensor or Sensor()
     if camera.blur_px > 0:

@@ -85,19 +85,7 @@ class Sheet(Table):
         return np.asarray(points_mm, float) @ direction - _of_pulse(self.position_mm, pulse)
 
     def light(self, points_mm: np.ndarray, pulse: int) -> np.ndarray:
-        """Return the light of a pulse at points, relative to its middle.
-
-        Parameters
-        ----------
-        points_mm : ndarray, shape (n, 3)
-            Points (x, y, z) [mm].
-        pulse : {0, 1}
-            First or second pulse.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-        """
+        """Return the light of a pulse at points (n, 3) [mm], relative to its middle, shape (n,)."""
         if self.thickness_mm is None:
             return np.ones(len(points_mm))
         distance, half = self.distance_mm(points_mm, pulse), _of_pulse(self.thickness_mm, pulse) / 2

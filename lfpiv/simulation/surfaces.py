@@ -81,7 +81,7 @@ Surfaces = Annotated[tuple[Surface, ...], Field(max_length=bounds.MOST_SOLIDS), 
 
 
 def solid(walls: tuple[HalfSpace | Box, ...] | None, points_mm: np.ndarray) -> np.ndarray:
-    """Return which points are in a wall.
+    """Return which points are in a wall, shape (n,), bool.
 
     Parameters
     ----------
@@ -89,10 +89,6 @@ def solid(walls: tuple[HalfSpace | Box, ...] | None, points_mm: np.ndarray) -> n
         The walls of a scene.
     points_mm : ndarray, shape (n, 3)
         Points (x, y, z) [mm].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
     """
     inside = np.zeros(len(points_mm), bool)
     for wall in walls or ():

@@ -97,14 +97,10 @@ def bent_pitch(camera: CalibratedCamera, points_mm: np.ndarray, degree: int) -> 
 
 
 def ray_models(camera: CalibratedCamera, centres_mm: np.ndarray, voxel_mm: float, form: str = "pixels") -> np.ndarray:
-    """Return ray models of single voxels, see `grid_models`.
+    """Return ray models of single voxels, shape (voxel, 38), float32; see `grid_models`.
 
     The projected edges are differences of the mapping between opposite faces of the voxel. `form` as in
     `grid_models`.
-
-    Returns
-    -------
-    ndarray, shape (voxel, 38), float32
     """
     degree = degree_of(camera, centres_mm, form)
     faces = np.concatenate([np.zeros((1, 3)), -np.eye(3), np.eye(3)])[:, None] * voxel_mm / 2

@@ -11,7 +11,7 @@ from lfpiv_kernels.transfer import Values, to_device, to_host
 
 
 def to_control_points(matrices: Sequence[np.ndarray], field: np.ndarray) -> wp.array:
-    """Return a field at control points, on the device.
+    """Return a field at control points, on the device, shape (z, y, x), float32 vectors.
 
     Parameters
     ----------
@@ -19,10 +19,6 @@ def to_control_points(matrices: Sequence[np.ndarray], field: np.ndarray) -> wp.a
         From values at the nodes of an axis to values at its control points, order (z, y, x).
     field : ndarray, shape (z, y, x, 3)
         Vectors at the nodes.
-
-    Returns
-    -------
-    wp.array of vectors, shape (z, y, x), float32
     """
     if runtime.device().form == "gpu":
         values = to_device(np.ascontiguousarray(field, np.float64), wp.float64)

@@ -98,10 +98,6 @@ def lens_rays(first_lens, centre, radius, edge, sensor_shape):
         Pixels along each side of a block.
     sensor_shape : tuple of int
         Rows and columns of the sensor.
-
-    Returns
-    -------
-    Microimages
     """
     corner = np.floor(centre - radius).astype(np.int32)
     count = LAYERS * centre[..., 0].size * edge**2

@@ -117,7 +117,7 @@ def few_pixels(optics: Optics) -> str:
 
 
 def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) -> np.ndarray:
-    """Return the labels of the dots that agree with their neighbours, and log the others.
+    """Return which labels are of dots that agree with their neighbours, shape (n,), bool, and log the others.
 
     Real optics depart smoothly from a thin lens. So each dot's mean departure is compared with the median departure of
     its neighbours in space.
@@ -130,10 +130,6 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
         Each label minus the ray of a fitted thin lens [mm].
     pitch_mm : float
         Microlens pitch [mm].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
     """
     number, first, inverse = np.unique(dots.dot, return_index=True, return_inverse=True)
     count = np.bincount(inverse)
