@@ -217,6 +217,11 @@ def smooth_light(shape):
     return np.clip(40 + 200 * spots + rng.normal(0, 3, shape), 0, 4095).round().astype(np.uint16)
 
 
+def picture(pixels, **options):
+    """Return a function that writes an image."""
+    return lambda path: tifffile.imwrite(path, pixels, **options)
+
+
 BAD_IMAGES = {
     "missing white": ("white/left.tif", lambda path: path.unlink(), ["white_image of camera 'left'", "no such file"]),
     "missing plane": (
@@ -231,57 +236,41 @@ BAD_IMAGES = {
     ),
     "other shape": (
         "particles/left/0001a.tif",
-        lambda path: tifffile.imwrite(path, np.ones((48, 63), np.uint16)),
+        picture(np.ones((48, 63), np.uint16)),
         ["(48, 64)", "(48, 63)", "white"],
     ),
-    "other dtype": (
-        "board/left/plane_00.tif",
-        lambda path: tifffile.imwrite(path, np.ones((48, 64), np.complex64)),
-        ["uint16", "complex64"],
-    ),
+    "other dtype": ("board/left/plane_00.tif", picture(np.ones((48, 64), np.complex64)), ["uint16", "complex64"]),
     "colour": (
         "board/left/plane_00.tif",
-        lambda path: tifffile.imwrite(path, np.ones((48, 64, 3), np.uint8), photometric="rgb"),
+        picture(np.ones((48, 64, 3), np.uint8), photometric="rgb"),
         ["single-channel", "colour"],
     ),
     "two pages": (
         "particles/right/0000a.tif",
-        lambda path: tifffile.imwrite(path, np.ones((2, 56, 40), np.uint8), photometric="minisblack"),
+        picture(np.ones((2, 56, 40), np.uint8), photometric="minisblack"),
         ["one", "2 pages"],
     ),
     "black white image": (
         "white/right.tif",
-        lambda path: tifffile.imwrite(path, np.zeros((56, 40), np.uint16)),
+        picture(np.zeros((56, 40), np.uint16)),
         ["white_image of camera 'right'", "all black"],
     ),
-    "black board": (
-        "board/left/plane_01.tif",
-        lambda path: tifffile.imwrite(path, np.zeros((48, 64), np.uint16)),
-        ["plane 1", "all black"],
-    ),
-    "black particles": (
-        "particles/left/0001b.tif",
-        lambda path: tifffile.imwrite(path, np.zeros((48, 64), np.uint16)),
-        ["pair 1", "all black"],
-    ),
+    "black board": ("board/left/plane_01.tif", picture(np.zeros((48, 64), np.uint16)), ["plane 1", "all black"]),
+    "black particles": ("particles/left/0001b.tif", picture(np.zeros((48, 64), np.uint16)), ["pair 1", "all black"]),
     "dark brighter than white": (
         "dark/right.tif",
-        lambda path: tifffile.imwrite(path, np.full((56, 40), 5000, np.uint16)),
+        picture(np.full((56, 40), 5000, np.uint16)),
         ["white", "brighter than the dark"],
     ),
-    "infinite counts": (
-        "white/left.tif",
-        lambda path: tifffile.imwrite(path, np.full((48, 64), np.inf, np.float32)),
-        ["finite"],
-    ),
+    "infinite counts": ("white/left.tif", picture(np.full((48, 64), np.inf, np.float32)), ["finite"]),
     "scaled white": (
         "white/left.tif",
-        lambda path: tifffile.imwrite(path, np.random.default_rng(0).random((48, 64), np.float32)),
+        picture(np.random.default_rng(0).random((48, 64), np.float32)),
         ["counts", "0 to 1"],
     ),
     "exchanged bytes": (
         "particles/left/0001b.tif",
-        lambda path: tifffile.imwrite(path, smooth_light((48, 64)).byteswap()),
+        picture(smooth_light((48, 64)).byteswap()),
         ["pair 1", "two bytes are exchanged", "byte order"],
     ),
     "empty file": ("board/left/plane_00.tif", lambda path: path.write_bytes(b""), ["truncated", "empty"]),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support.vector_sets import DT_S, VOXEL_MM, from_flow, random_vectors, write_run
+from support.vector_sets import DT_S, VOXEL_MM, from_flow, random_vectors, random_volume, write_run
 
 import lfpiv
 from lfpiv import derived
@@ -26,12 +26,8 @@ def run(tmp_path_factory):
     """Return the folder of a run with the volumes of one pair, and its vectors. Tests must not change it."""
     folder = tmp_path_factory.mktemp("run")
     written = write_run(folder, NUMBERS)
-    places = {
-        name: (name, -0.4 + np.arange(n) * 0.1, {"units": "mm"}) for name, n in zip("zyx", (3, 4, 5), strict=True)
-    }
     for frame in "ab":
-        values = np.random.default_rng(ord(frame)).random((3, 4, 5), np.float32)
-        volume = xr.DataArray(values, places, ("z", "y", "x"), attrs={"units": "counts"})
+        volume = random_volume(ord(frame), units="counts")
         netcdf.write_volume(volume, folder / "volumes" / f"pair_0002_{frame}.nc", attributes={})
     return folder, written
 
@@ -67,7 +63,7 @@ def test_paraview_images_hold_the_vectors_at_their_places(run, tmp_path):
     stored = netcdf.read_volume(folder / "volumes" / "pair_0002_b.nc")
     image = volumes.read()[0]
     np.testing.assert_array_equal(at_points(image, "intensity"), stored.values)
-    assert np.allclose(image.origin, -0.4) and np.allclose(image.spacing, 0.1)
+    assert np.allclose(image.origin, 0.0) and np.allclose(image.spacing, 0.1)
 
 
 def test_a_single_layer_of_vectors_is_an_image_too(tmp_path):
@@ -87,12 +83,10 @@ def test_volumes_of_other_settings_are_not_exported(tmp_path, caplog):
     for number, kept in images.items():  # vectors of one voxel size, of images that are gone by now for the last pair
         write_run(tmp_path, (number,), depends_on=depends_on(0.08, kept, correlation={"overlap": 0.5}))
     made = {0: (0.08, images[0]), 1: (0.1, images[1]), 2: (0.08, [["a.tif", 7, 9]]), 3: (0.08, [["a.tif", 7, 4]])}
-    places = {name: (name, np.arange(n) * 0.1) for name, n in zip("zyx", (3, 4, 5), strict=True)}
-    volume = xr.DataArray(np.ones((3, 4, 5), np.float32), places, ("z", "y", "x"))
     for number, stamp in made.items():
         for frame in "ab":
             path = tmp_path / "volumes" / f"pair_{number:04d}_{frame}.nc"
-            netcdf.write_volume(volume, path, attributes={"depends_on": depends_on(*stamp)})
+            netcdf.write_volume(random_volume(0), path, attributes={"depends_on": depends_on(*stamp)})
     with caplog.at_level(logging.WARNING):
         lfpiv.export_results(tmp_path, "vti", out=tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").glob("volume_*.vti")} == {

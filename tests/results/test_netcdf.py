@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.stored import rewrite
+from support.vector_sets import random_vectors, random_volume
 
 from lfpiv.errors import InputError
 from lfpiv.results import netcdf, provenance
@@ -13,34 +14,12 @@ from lfpiv.results.pair_files import FrameRecord, FrameVolume, PairVolumes, Volu
 from lfpiv.warn import Code, Warning
 
 
-def vectors(seed=0, shape=(2, 3, 4)):
-    """A small vector dataset in the form every correlation writes."""
-    rng = np.random.default_rng(seed)
-    names = [name for name in netcdf.VECTOR_UNITS if name != "valid"]
-    variables = {
-        name: (("z", "y", "x"), rng.normal(size=shape), {"units": netcdf.VECTOR_UNITS[name]}) for name in names
-    }
-    variables["valid"] = (("z", "y", "x"), rng.random(shape) > 0.2)
-    variables["uncertainty"][1][0, 0, 0] = np.nan
-    for name, axis in zip("uvw", "xyz", strict=True):  # 0.1 mm per voxel in 1 ms
-        variables[name] = (("z", "y", "x"), 0.1 * variables[f"displacement_{axis}"][1], {"units": "m/s"})
-    coordinates = {name: (name, np.arange(n) * 0.4, {"units": "mm"}) for name, n in zip("zyx", shape, strict=True)}
-    return xr.Dataset(
-        variables,
-        coordinates,
-        {"dt_s": 1e-3, "voxel_mm": [0.1] * 3, "verdict": "most vectors are valid", "passes": [{"window": [8, 8, 8]}]},
-    )
-
-
 def volume(seed, residual):
-    rng = np.random.default_rng(seed)
-    coordinates = {name: (name, np.arange(n) * 0.1) for name, n in zip("zyx", (3, 4, 5), strict=True)}
-    attributes = {"residual": residual, "stop": "iteration limit reached"}
-    return xr.DataArray(rng.random((3, 4, 5), np.float32), coordinates, ("z", "y", "x"), attrs=attributes)
+    return random_volume(seed, residual=residual, stop="iteration limit reached")
 
 
 def test_vectors_and_volumes_come_back_as_written(tmp_path):
-    written, pair = vectors(), {"a": volume(1, [0.9, 0.5, 0.4]), "b": volume(2, [0.8, 0.6])}
+    written, pair = random_vectors(0), {"a": volume(1, [0.9, 0.5, 0.4]), "b": volume(2, [0.8, 0.6])}
     path = tmp_path / "pair_0000.nc"
     reconstruction = netcdf.build_reconstruction(pair)
     attributes = {"settings_hash": "0123", "smart": {"iterations": 2}}
@@ -65,7 +44,7 @@ def test_vectors_and_volumes_come_back_as_written(tmp_path):
 def test_flags_that_are_no_flags_are_refused(tmp_path):
     """Reading as a dataset turns every number but 0 into True."""
     path = tmp_path / "pair.nc"
-    netcdf.write_vectors(vectors(), path, attributes={})
+    netcdf.write_vectors(random_vectors(0), path, attributes={})
     rewrite(path, lambda file: file["valid"].__setitem__(0, 7), sealed=True)
     with pytest.raises(InputError, match="other than 0 and 1"):
         netcdf.read_vectors(path)
@@ -95,13 +74,13 @@ def test_what_is_known_of_the_images_travels_with_the_volumes(tmp_path):
 
 def test_a_vector_file_of_another_form_is_refused(tmp_path):
     with pytest.raises(ValueError, match="peak_ratio"):
-        netcdf.write_vectors(vectors().drop_vars("peak_ratio"), tmp_path / "pair.nc", attributes={})
-    wrong = vectors()
+        netcdf.write_vectors(random_vectors(0).drop_vars("peak_ratio"), tmp_path / "pair.nc", attributes={})
+    wrong = random_vectors(0)
     wrong["u"].attrs["units"] = "mm/s"
     with pytest.raises(ValueError, match="m/s"):
         netcdf.write_vectors(wrong, tmp_path / "pair.nc", attributes={})
     assert not any(tmp_path.iterdir())
-    netcdf.write_vectors(vectors().assign_attrs(schema_version=99), tmp_path / "pair.nc", attributes={})
+    netcdf.write_vectors(random_vectors(0).assign_attrs(schema_version=99), tmp_path / "pair.nc", attributes={})
     with pytest.raises(InputError, match="schema version"):
         netcdf.read_vectors(tmp_path / "pair.nc")
     (tmp_path / "pair.nc").write_bytes(b"no NetCDF")

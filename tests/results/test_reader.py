@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from support.stored import rewrite
-from support.vector_sets import random_vectors, write_run
+from support.vector_sets import random_vectors, random_volume, write_run
 
 import lfpiv
 from lfpiv.results import datasets, netcdf
@@ -178,16 +178,15 @@ def test_velocities_that_contradict_their_displacements_are_refused(tmp_path, sp
         netcdf.read_vectors(tmp_path / "bad.nc")
 
 
-def volume(seed):
-    rng = np.random.default_rng(seed)
-    places = {name: (name, np.arange(n) * 0.1, {"units": "mm"}) for name, n in zip("zyx", (3, 4, 5), strict=True)}
-    attributes = {"residual": [0.9, 0.5], "stop": "iteration limit reached", "units": "counts"}
-    return xr.DataArray(rng.random((3, 4, 5), np.float32), places, ("z", "y", "x"), attrs=attributes)
-
-
 def test_plain_xarray_opens_every_file(tmp_path):
     """Open files without engine, group or settings."""
-    written, frames = random_vectors(0), {"a": volume(1), "b": volume(2)}
+    written, frames = (
+        random_vectors(0),
+        {
+            name: random_volume(name == "b", residual=[0.9, 0.5], stop="iteration limit reached", units="counts")
+            for name in "ab"
+        },
+    )
     path = tmp_path / "pair_0000.nc"
     netcdf.write_vectors(written, path, attributes={}, reconstruction=netcdf.build_reconstruction(frames))
     netcdf.write_volume(frames["a"], tmp_path / "volume.nc", attributes={})

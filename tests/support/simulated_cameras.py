@@ -3,9 +3,12 @@
 import sys
 
 import numpy as np
+import pytest
 from support import scenes
 
+from lfpiv.errors import InputError
 from lfpiv.simulation.scene import Scene, SceneCamera
+from lfpiv.simulation.simulator import simulate
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -106,6 +109,16 @@ def small_scene(**tables):
     for name, table in tables.items():
         content[name] = content.get(name, {}) | table if isinstance(table, dict) else table
     return Scene.model_validate(content)
+
+
+def refusal(text, folder):
+    """Return the one line by which a scene is refused before anything is written."""
+    (folder / "scene.toml").write_text(text, "utf-8")
+    with pytest.raises(InputError) as error:
+        simulate(folder / "scene.toml", folder / "out")
+    assert "\n" not in str(error.value)
+    assert [path.name for path in folder.iterdir()] == ["scene.toml"]
+    return str(error.value)
 
 
 def camera(rig="misaligned", **changes):

@@ -4,6 +4,7 @@ import numpy as np
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
 
 from lfpiv.geometry.grid import Grid
+from lfpiv.tracking.refinement import Scene, rendered
 from lfpiv.weights.operator import build_weights
 from lfpiv_kernels.rendering import render
 
@@ -69,3 +70,10 @@ def _eye(camera):
         lens_gain=np.ones((80, 80), np.float32),
         first_lens=(-40, -40),
     )
+
+
+def noisy_scene(images, places_mm, light):
+    """Return the noisy images of particles."""
+    true = rendered(images, images.lists(places_mm), light)
+    noise = READ_NOISE * np.random.default_rng(0).standard_normal(true.shape)
+    return Scene(counts=(true + noise).astype(np.float32), read_variance=np.full_like(true, READ_NOISE**2))

@@ -44,6 +44,13 @@ def random_vectors(seed, shape=SHAPE):
     )
 
 
+def random_volume(seed, **attributes):
+    """Return a random volume of 3 x 4 x 5 voxels."""
+    places = {name: (name, np.arange(n) * 0.1, {"units": "mm"}) for name, n in zip("zyx", (3, 4, 5), strict=True)}
+    values = np.random.default_rng(seed).random((3, 4, 5), np.float32)
+    return xr.DataArray(values, places, ("z", "y", "x"), attrs=attributes)
+
+
 def write_run(folder, numbers, *, shape=SHAPE, **attributes):
     """Write random vectors of pairs, each with its number as seed; return them."""
     written = {number: random_vectors(number, shape) for number in numbers}

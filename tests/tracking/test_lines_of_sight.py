@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from scipy import sparse
-from support.tracking_rig import READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
+from support.tracking_rig import SIGMA_VOXEL, VOXEL_MM, TrackingRig, noisy_scene
 
 from lfpiv.tracking.lines_of_sight import LARGEST_LACK, STEP_VOXEL, Line, follow_lines
 from lfpiv.tracking.particle_images import ParticleImages
-from lfpiv.tracking.refinement import Cloud, Scene, linearise, refine, rendered
+from lfpiv.tracking.refinement import Cloud, linearise, refine
 
 LIGHT = 2e4
 SCATTER = 0.5
@@ -35,13 +35,6 @@ def axis(images, camera):
     return np.asarray(list(images.cameras.values())[camera].pose)[2]
 
 
-def seen(images, places_mm, light):
-    """Return the noisy images of particles."""
-    true = rendered(images, images.lists(places_mm), light)
-    noise = READ_NOISE * np.random.default_rng(0).standard_normal(true.shape)
-    return Scene(counts=(true + noise).astype(np.float32), read_variance=np.full_like(true, READ_NOISE**2))
-
-
 def followed(images, scene, cloud, chosen):
     normal = linearise(images, scene, cloud, SCATTER)
     return follow_lines(images, scene, cloud, normal, np.array(chosen))
@@ -55,7 +48,7 @@ def beside(images, camera, sign=1):
 @pytest.fixture(scope="module")
 def both_shown(images):
     """Images of two particles that both cameras show."""
-    return seen(images, np.vstack([TRUE, FAR]), np.array([[LIGHT, 0.5 * LIGHT], [LIGHT, LIGHT]]))
+    return noisy_scene(images, np.vstack([TRUE, FAR]), np.array([[LIGHT, 0.5 * LIGHT], [LIGHT, LIGHT]]))
 
 
 @pytest.mark.parametrize("camera", [0, 1])
@@ -82,7 +75,7 @@ def test_two_candidates_that_share_the_light_of_one_particle_become_one(images, 
 
 
 def test_light_that_one_camera_alone_shows_stays_explained(images):
-    scene = seen(images, TRUE[None], np.array([[LIGHT, 0.0]]))
+    scene = noisy_scene(images, TRUE[None], np.array([[LIGHT, 0.0]]))
     cloud = Cloud(positions_mm=beside(images, 0)[None], light=np.array([[0.9 * LIGHT, 10.0]]))
     found = followed(images, scene, cloud, [True])
     np.testing.assert_array_equal(found.positions_mm, cloud.positions_mm)
@@ -92,7 +85,7 @@ def test_light_that_one_camera_alone_shows_stays_explained(images):
 def test_light_beside_the_line_makes_no_particle(images):
     """Places near it would lack light on one side."""
     aside = TRUE + [0.0, 1.2 * VOXEL_MM, 0.0]  # across both lines of sight
-    scene = seen(images, np.vstack([TRUE, aside]), np.array([[LIGHT, 0.0], [0.0, LIGHT]]))
+    scene = noisy_scene(images, np.vstack([TRUE, aside]), np.array([[LIGHT, 0.0], [0.0, LIGHT]]))
     cloud = Cloud(positions_mm=np.vstack([beside(images, 0)]), light=np.array([[LIGHT, 0.0]]))
     found = followed(images, scene, cloud, [True])
     np.testing.assert_array_equal(found.positions_mm, cloud.positions_mm)
@@ -109,7 +102,7 @@ def test_nothing_changes_with_one_camera_or_without_particles_to_move(images, bo
     cloud = Cloud(positions_mm=np.vstack([TRUE, FAR]), light=np.full((2, 2), LIGHT))
     assert followed(images, both_shown, cloud, [False, False]) is cloud
     alone = ParticleImages(cameras=TrackingRig((20.0,)).cameras, voxel_mm=VOXEL_MM, sigma_voxel=SIGMA_VOXEL)
-    scene = seen(alone, TRUE[None], np.array([[LIGHT]]))
+    scene = noisy_scene(alone, TRUE[None], np.array([[LIGHT]]))
     one = Cloud(positions_mm=TRUE[None], light=np.array([[LIGHT]]))
     assert followed(alone, scene, one, [True]) is one
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy import optimize, sparse
-from support.tracking_rig import READ_NOISE, SIGMA_VOXEL, VOXEL_MM, TrackingRig
+from support.tracking_rig import SIGMA_VOXEL, VOXEL_MM, TrackingRig, noisy_scene
 
 from lfpiv.tracking.particle_images import ParticleImages
-from lfpiv.tracking.refinement import Cloud, Scene, refine, rendered
+from lfpiv.tracking.refinement import Cloud, refine
 from lfpiv.tracking.splitting import DIRECTIONS, HALF_DISTANCES, fit_pairs, split
 
 SCATTER = 0.3
@@ -22,13 +22,6 @@ EXACT_VOXEL = 0.05
 @pytest.fixture(scope="module")
 def images(device):
     return ParticleImages(cameras=TrackingRig().cameras, voxel_mm=VOXEL_MM, sigma_voxel=SIGMA_VOXEL)
-
-
-def seen(images, places_mm, light):
-    """Return the noisy images of particles."""
-    true = rendered(images, images.lists(places_mm), light)
-    noise = READ_NOISE * np.random.default_rng(0).standard_normal(true.shape)
-    return Scene(counts=(true + noise).astype(np.float32), read_variance=np.full_like(true, READ_NOISE**2))
 
 
 def fitted(images, scene, places_mm, light):
@@ -48,7 +41,7 @@ def test_two_particles_take_the_place_of_one_between_them(images, along):
     far, middle = np.array([-0.4, 0.4, 0.2]), np.array([0.2, -0.1, 0.05])
     places = np.stack([middle + sign * HALF_VOXEL * VOXEL_MM * along for sign in (1, -1)])
     light = np.array([[LIGHT, 1.3 * LIGHT], [1.2 * LIGHT, LIGHT], [LIGHT, LIGHT]])
-    scene = seen(images, np.concatenate([places, [far]]), light)
+    scene = noisy_scene(images, np.concatenate([places, [far]]), light)
     cloud, normal = fitted(images, scene, [middle, far], [light[:2].sum(0), light[2]])
     pair = split(images, scene, cloud, normal, np.array([True, True]))
     assert len(pair) == 2  # the particle that is one stays one
@@ -60,7 +53,7 @@ def test_two_particles_take_the_place_of_one_between_them(images, along):
 
 def test_nothing_is_split_that_is_not_chosen(images):
     places = np.array([[0.1, 0.1, 0.0], [0.1 + 1.7 * VOXEL_MM, 0.1, 0.0]])
-    scene = seen(images, places, np.full((2, 2), LIGHT))
+    scene = noisy_scene(images, places, np.full((2, 2), LIGHT))
     cloud, normal = fitted(images, scene, [places.mean(0)], [[2 * LIGHT, 2 * LIGHT]])
     assert len(split(images, scene, cloud, normal, np.array([False]))) == 0
     assert len(split(images, scene, cloud, normal, np.array([True]))) == 2

@@ -5,7 +5,6 @@ import pytest
 import xarray as xr
 from support.vector_sets import axes, from_flow, random_vectors
 
-import lfpiv
 from lfpiv import derived, statistics
 from lfpiv.velocity.derived import check_velocity
 from lfpiv.velocity.statistics import STRESSES
@@ -215,14 +214,20 @@ def test_a_known_gaussian_ensemble_gives_its_covariance():
         assert abs(float(stresses[name]) - covariance[row, column]) < SAMPLING * error
 
 
+def correlated_series(rng, pairs, places, memory):
+    """Return Gaussian numbers with correlation memory^k between pairs k apart."""
+    series = np.empty((pairs, places))
+    series[0] = rng.normal(size=places)
+    for step in range(1, pairs):
+        series[step] = memory * series[step - 1] + np.sqrt(1 - memory**2) * rng.normal(size=places)
+    return series
+
+
 @pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])
 def test_the_standard_error_is_the_scatter_of_means_of_correlated_pairs(memory):
     rng = np.random.default_rng(5)
     pairs, places = 600, 500  # as many realisations as places, independent of one another
-    series = np.empty((pairs, places))
-    series[0] = rng.normal(size=places)
-    for step in range(1, pairs):  # correlation memory^k between pairs k apart
-        series[step] = memory * series[step - 1] + np.sqrt(1 - memory**2) * rng.normal(size=places)
+    series = correlated_series(rng, pairs, places, memory)
     present = np.sort(rng.choice(pairs, 450, replace=False))  # pairs may be missing
     valid = rng.random((450, places)) > 0.1
     vectors = ensemble(series[present], valid=valid, numbers=present)
@@ -244,10 +249,7 @@ SHORT = 0.12
 def test_the_standard_error_of_short_series_allows_for_their_estimated_mean(memory, pairs, complete):
     rng = np.random.default_rng(6)
     places = 4000  # independent of one another
-    series = np.empty((pairs, places))
-    series[0] = rng.normal(size=places)
-    for step in range(1, pairs):
-        series[step] = memory * series[step - 1] + np.sqrt(1 - memory**2) * rng.normal(size=places)
+    series = correlated_series(rng, pairs, places, memory)
     valid = rng.random(series.shape) >= (0.0 if complete else 0.15)
     errors = statistics.standard_error(ensemble(series, valid=valid)).standard_error_u.values.ravel()
     counted = valid.astype(float)
@@ -257,8 +259,3 @@ def test_the_standard_error_of_short_series_allows_for_their_estimated_mean(memo
     true = np.sqrt(total[known]) / counted.sum(0)[known]
     assert np.isnan(errors[~known]).all()
     assert abs(np.sqrt((errors[known] ** 2).mean() / (true**2).mean()) - 1) < SHORT
-
-
-def test_modules_are_reached_from_the_package():
-    assert lfpiv.derived is derived and lfpiv.statistics is statistics
-    assert {"derived", "statistics"} <= set(dir(lfpiv))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from support.ideal_rig import IdealCamera, IdealRig, lattice, optics, rotation
+from support.pixel_rows import assert_rows_see_all_light_once
 
 import lfpiv
 from lfpiv.reconstruction.ordered_subsets import Subset
@@ -54,14 +55,7 @@ def test_rows_are_taken_alone_where_all_weights_of_a_large_volume_are_pixel_by_p
 
 
 def test_rows_of_pixels_see_all_of_the_light_once(hexagonal):
-    for name in hexagonal.cameras:
-        projector = hexagonal.projector(name)
-        alone = [projector.see_only(number) for number in range(projector.ray_sets)]
-        pixels = np.concatenate(alone)
-        assert len(np.unique(pixels)) == len(pixels) > 0.8 * len(projector.map.pixel)
-        light = hexagonal.light_of_sets(name)
-        image = projector.project(np.ones(GRID.size, np.float32), np.zeros(hexagonal.gain(name).size, np.float32))
-        assert light.sum() == pytest.approx((image * hexagonal.gain(name))[pixels].sum(), rel=1e-5)
+    assert_rows_see_all_light_once(hexagonal, least=0.8)
 
 
 def test_rows_that_do_not_fit_the_memory_are_left_out(hexagonal):
