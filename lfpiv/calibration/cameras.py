@@ -172,7 +172,8 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
         )
         for setup in experiment.cameras
     ]
-    errors = fit_board(cameras, board)
+    with input_errors(f"{experiment.path}: labels of all cameras"):
+        errors = fit_board(cameras, board)
     pitch = min(setup.optics.microlens_pitch_mm / abs(setup.optics.magnification) for setup in experiment.cameras)
     _log_board(errors)
     with collected() as warnings:

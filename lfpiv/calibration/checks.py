@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,19 +27,14 @@ from lfpiv.experiment.experiment import CameraSetup, Experiment, white_level
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import (
     APERTURE,
-    GAP_LIGHT,
-    NO_PLACE,
     OTHER_APERTURE,
     fingerprint,
-    gap_light,
     microimage_px,
     stated_px,
 )
-from lfpiv.lightfield.lattice_fit import disagreement
 from lfpiv.lightfield.saturation import SATURATED, saturated_share
 from lfpiv.lightfield.tone_curve import CURVED, tone_exponent
-from lfpiv.warn import SENTENCES, Code, Warning, warn
-from lfpiv.warn.sentences import OTHER_LIGHT, SHIFTED_LIGHT
+from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
@@ -209,18 +204,8 @@ def _medium(index: float) -> dict[str, float]:
     return {"index": index, "depth": 1 / index}
 
 
-def check_light(
-    experiment: Experiment,
-    setup: CameraSetup,
-    decoder: LightFieldDecoder,
-    images: Sequence[np.ndarray],
-    dark: np.ndarray | None,
-    others: Callable[[], Mapping[str, LightFieldDecoder]],
-) -> None:
-    """Refuse board images that are copies or that belong to another white image. Warn of saturation and tone curves.
-
-    `others` returns the decoders of the other cameras, of which an image that does not fit may be.
-    """
+def check_light(experiment: Experiment, setup: CameraSetup, images: Sequence[np.ndarray]) -> None:
+    """Refuse board images that are copies. Warn of saturation and tone curves."""
     paths = [experiment.board_path(setup.name, plane) for plane in range(len(images))]
     first: dict[bytes, int] = {}
     saturated = np.zeros(len(images))
@@ -238,19 +223,6 @@ def check_light(
         warn(log, Warning(code=Code.BOARD_SATURATED, subject=setup.name, figures=figures))
     plane = len(images) // 2
     _check_tones(f"{setup.name}, plane {plane}", images[plane])
-    image = images[plane] if dark is None else images[plane] - dark
-    light = gap_light(image, decoder)
-    above = image - np.float32(decoder.background(image)[0])
-    if light > NO_PLACE or disagreement(above, decoder) is not None:
-        shift = disagreement(above, decoder, others(), misplaced=light > NO_PLACE)
-        sentences = [SENTENCES[Code.MISPLACED]] if light > NO_PLACE else []
-        if shift is not None:
-            sentences.append((SHIFTED_LIGHT if "shift_px" in shift else OTHER_LIGHT).format(**shift) + ".")
-        raise InputError(
-            f"{paths[plane]}: board.images of camera {setup.name!r}: {' '.join(sentences)} Are these board images?"
-        )
-    if light > GAP_LIGHT:
-        warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[plane])}))
 
 
 def check_focus(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:

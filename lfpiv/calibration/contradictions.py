@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,14 @@ from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely
 from lfpiv.calibration.board.planes import Signals, board_images
 from lfpiv.calibration.liquid import LiquidSurface, median_distance, mistake_in_liquid
 from lfpiv.calibration.thin_lens_model import ThinLensModel
+from lfpiv.errors import InputError
 from lfpiv.experiment.axes import MIRRORED, UPSIDE_DOWN, names_of, stated_for
 from lfpiv.experiment.experiment import CameraSetup, Experiment
 from lfpiv.lightfield.decoder import LightFieldDecoder
-from lfpiv.lightfield.image_checks import gap_light
-from lfpiv.warn import Code, Warning, warn
+from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, gap_light
+from lfpiv.lightfield.lattice_fit import disagreement
+from lfpiv.warn import SENTENCES, Code, Warning, warn
+from lfpiv.warn.sentences import OTHER_LIGHT, SHIFTED_LIGHT
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +47,45 @@ images belong to the other camera."""
 Decoders = Callable[[CameraSetup], LightFieldDecoder]
 Dots = Callable[[CameraSetup, LightFieldDecoder, Mistake], BoardDots | None]
 """Measures the dots of a camera as they are if a mistake was made; None where it finds none."""
+
+
+def check_place(
+    experiment: Experiment,
+    setup: CameraSetup,
+    decoder: LightFieldDecoder,
+    images: Sequence[np.ndarray],
+    others: Callable[[], Mapping[str, LightFieldDecoder]],
+) -> None:
+    """Refuse board images whose light does not lie in the microimages of the white image.
+
+    `others` returns the decoders of the other cameras, of which an image that does not fit may be.
+    """
+    dark, paths = experiment.dark(setup.name), [experiment.board_path(setup.name, n) for n in range(len(images))]
+    between, wrong, found = np.zeros(len(images)), [], ""
+    for plane, image in enumerate(images):
+        light = image if dark is None else image - dark
+        between[plane] = gap_light(light, decoder)
+        above, misplaced = light - np.float32(decoder.background(light)[0]), bool(between[plane] > NO_PLACE)
+        if misplaced or disagreement(above, decoder) is not None:
+            wrong.append(plane)
+            found = found or _found(disagreement(above, decoder, others(), misplaced=misplaced), misplaced)
+    worst = int(between.argmax())
+    if wrong:
+        found += " Are these board images?"
+        if len(wrong) < len(images):
+            which = f"plane {wrong[0]} does" if len(wrong) == 1 else f"planes {', '.join(map(str, wrong))} do"
+            found += f" Only {which} not fit the white image: record the board again, or leave out what does not fit."
+        raise InputError(f"{paths[wrong[0]]}: board.images of camera {setup.name!r}: {found}")
+    if between[worst] > GAP_LIGHT:
+        warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[worst])}))
+
+
+def _found(shift: Mapping[str, Any] | None, misplaced: bool) -> str:
+    """Say how the light of a board image lies beside the microimages of the white image."""
+    sentences = [SENTENCES[Code.MISPLACED]] if misplaced else []
+    if shift is not None:
+        sentences.append((SHIFTED_LIGHT if "shift_px" in shift else OTHER_LIGHT).format(**shift) + ".")
+    return " ".join(sentences)
 
 
 def doubtful(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel, surface: LiquidSurface | None) -> bool:

@@ -124,8 +124,9 @@ def _others(experiment: Experiment, setup: CameraSetup) -> dict[str, LightFieldD
 def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgress) -> Measured:
     sensor = decode(experiment, setup)
     step(0.2)
-    dark, images = experiment.dark(setup.name), board_images(experiment, setup.name)
-    checks.check_light(experiment, setup, sensor.decoder, images, dark, lambda: _others(experiment, setup))
+    images = board_images(experiment, setup.name)
+    checks.check_light(experiment, setup, images)
+    contradictions.check_place(experiment, setup, sensor.decoder, images, lambda: _others(experiment, setup))
 
     known: BoardDots | None = None
 
@@ -205,28 +206,30 @@ def _measure_dots(
     board = replace(board, planes_mm=mistake.depths_mm(board.planes_mm))
     place = f"{experiment.path}: board.images of camera {setup.name!r}"
     with input_errors(place):
-        try:
-            dots = measure_board(
-                images,
-                decoder,
-                board,
-                orientation=None if setup.orientation is None else mistake.orientation(setup.orientation),
-                estimator=experiment.network.estimator,
-                dark=dark,
-            )
-        except np.linalg.LinAlgError:
-            raise InputError(
-                "expected images of the board's dots, found blobs that no camera sees as a board. Check that these are "
-                "board images, and check the numbers in [board]."
-            ) from None
+        dots = measure_board(
+            images,
+            decoder,
+            board,
+            orientation=None if setup.orientation is None else mistake.orientation(setup.orientation),
+            estimator=experiment.network.estimator,
+            dark=dark,
+        )
     checks.check_planes(experiment, setup, dots)
     return dots
 
 
 @contextlib.contextmanager
 def input_errors(place: str) -> Iterator[None]:
-    """Name the file and the camera in every InputError; any other error is a fault of the program."""
+    """Name the file and the camera in every InputError, and where a matrix is singular.
+
+    Any other error is a fault of the program.
+    """
     try:
         yield
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"{place}: expected a board's dots at several places and depths, found dots that determine no camera, or "
+            "blobs that are no dots. Look at the board images, and check the numbers in [board]."
+        ) from None

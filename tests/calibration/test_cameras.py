@@ -75,6 +75,8 @@ def test_a_fault_of_the_program_is_not_called_wrong_input():
         assert not isinstance(raised.value, lfpiv.InputError)
     with pytest.raises(lfpiv.InputError, match=r"rig\.toml: few dots"), input_errors("rig.toml"):
         raise lfpiv.InputError("few dots")
+    with pytest.raises(lfpiv.InputError, match=r"rig\.toml: .*determine no camera"), input_errors("rig.toml"):
+        np.linalg.inv(np.zeros((2, 2)))  # as dots in a line make it
 
 
 def test_the_mapping_meets_the_true_rays(rig):
@@ -390,6 +392,13 @@ def test_small_microimages_leave_enough_pixels(rig, tmp_path):
     points, pupil = rays_in([-1, -1, -0.8], [1, 1, 0.8], radius=6.25)
     miss = np.linalg.norm(camera.map(points, pupil) - true_mapping(spec)(points, pupil), axis=1)
     assert miss.mean() / 0.1 <= MAPPING_AIM_PITCH
+
+
+def test_the_image_of_a_plane_that_lies_beside_the_white_image_is_named(rig, tmp_path):
+    experiment, _, _ = rig
+    beside = np.roll(experiment.board_image("only", 1).astype(np.uint16), 3, axis=1)
+    with pytest.raises(lfpiv.InputError, match=r"plane_01\.tif.*light lies 3\.. px.*Only plane 1 does not fit"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {1: beside}))
 
 
 def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
