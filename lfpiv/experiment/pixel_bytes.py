@@ -53,11 +53,11 @@ def fault(image: np.ndarray) -> str | None:
             "sign. Save the image as recorded, or subtract in numbers with a sign and save those"
         )
     middle = image[(len(image) - min(len(image), _PIXELS // image.shape[1])) // 2 :][: _PIXELS // image.shape[1]]
-    next_row, second, third = _likeness(np.maximum(middle, 0).T, (1, 2, 3))
-    if second > ALIKE and 1 - max(next_row, third) > INTERLACED * (1 - second):
+    middle = np.maximum(middle, 0)
+    if (alternate := _alternate(middle.T)) and not _alternate(middle):  # microimages of 2 pixels: columns do as well
         return (
             "rows of two exposures in turn, as interlaced video has them (neighbouring rows correlate by "
-            f"{next_row:.2f}, every other row by {second:.2f}). Record whole frames, without interlacing"
+            f"{alternate[0]:.2f}, every other row by {alternate[1]:.2f}). Record whole frames, without interlacing"
         )
     if not (low >= 0 and 256 <= high < _TWO_BYTES) or (rows != np.rint(rows)).any():
         return None
@@ -84,6 +84,13 @@ def _wrapped(rows: np.ndarray, full: int) -> bool:
     return bool(
         count > BELOW_ZERO * rows.size and zero > LEAST_ZERO * count and zero + same > (1 - MOST_BETWEEN) * count
     )
+
+
+def _alternate(pixels: np.ndarray) -> list[float] | None:
+    """Return the correlation of pixels one and two apart along the rows if every other pixel is alike; else None."""
+    beside, second, third = _likeness(pixels, (1, 2, 3))
+    alternate = second > ALIKE and 1 - max(beside, third) > INTERLACED * (1 - second)
+    return [beside, second] if alternate else None
 
 
 def _varies(values: np.ndarray) -> bool:

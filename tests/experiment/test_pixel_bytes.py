@@ -54,3 +54,11 @@ def test_rows_of_two_exposures_in_turn_are_named(light):
     assert "interlaced" in fault(later.astype(np.float32))
     assert "interlaced" in fault((later // 16).astype(np.float32))
     assert fault((light * np.where(np.arange(len(light)) % 2, 1.05, 1)[:, None]).round().astype(np.float32)) is None
+
+
+@pytest.mark.parametrize("pitch", [1.9, 2.0, 2.2])
+def test_microimages_of_two_pixels_are_not_interlaced(pitch):
+    y, x = np.indices(SHAPE)
+    lattice = (1 + np.cos(2 * np.pi * x / pitch)) * (1 + np.cos(2 * np.pi * y / pitch))
+    noise = np.random.default_rng(3).normal(0, 3, SHAPE)
+    assert fault((40 + 500 * lattice + noise).round().clip(0).astype(np.float32)) is None
