@@ -1,4 +1,7 @@
-"""Find pairs whose flow runs against that of all others: their frames are exchanged in every camera."""
+"""Find pairs whose flow runs against that of all others, and runs in which nothing moves.
+
+The frames of the first are exchanged in every camera. Both frames of the others may show the same exposures.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,8 @@ ALIKE = 0.8
 """Least likeness of a run's pairs, median of the magnitudes: a flow that fluctuates so much may turn."""
 LEAST_VALID = 0.5
 """Least share of valid vectors of a pair that is compared."""
+STILL = 0.5
+"""Movement over the median uncertainty of a pair's vectors, below which nothing moves: chance alone makes more."""
 FEW = 0.1
 """Largest share of reversed pairs, where it is more than one: a flow that oscillates has more."""
 
@@ -39,6 +44,19 @@ def reversed_pairs(figures: Mapping[int, PairFigures]) -> list[Warning]:
         return []
     others = {"others": f"that of the other {len(likeness) - len(negative)}"}
     return [Warning(code=Code.REVERSED, pairs=tuple(negative), figures=others)]
+
+
+def still(figures: Mapping[int, PairFigures]) -> list[Warning]:
+    """Return the warning that nothing moves by more than `STILL` uncertainties, in any pair or eighth of the volume."""
+    moved = [
+        (max(one.moved_voxel, *np.abs(one.flow_voxel)), one.uncertainty_voxel)
+        for one in figures.values()
+        if one.moved_voxel is not None and one.flow_voxel is not None and one.uncertainty_voxel is not None
+    ]
+    if not moved or any(voxel >= STILL * uncertainty for voxel, uncertainty in moved):
+        return []
+    voxel, uncertainty = map(float, np.max(moved, axis=0))
+    return [Warning(code=Code.STILL, figures={"voxel": voxel, "uncertainty": uncertainty})]
 
 
 def _likeness(pairs: Sequence[int], figures: Mapping[int, PairFigures]) -> dict[int, float]:

@@ -40,7 +40,7 @@ from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.refinement import Refinement
-from lfpiv.runs.reversed_pairs import reversed_pairs
+from lfpiv.runs.reversed_pairs import reversed_pairs, still
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.warn import Gathering, Warning, collected, warn
 from lfpiv_kernels import runtime
@@ -315,8 +315,8 @@ class Run:
             self._keep(self.files(pair))
 
     def _unlike_pairs(self, contents: Contents) -> list[Warning]:
-        """Log and return the warnings about pairs unlike the others: by their flow, or by a camera's scale."""
-        found = [*reversed_pairs(contents.vectors), *other_scales(contents.vectors)]
+        """Log and return the warnings about pairs unlike the others, by flow or a camera's scale, and pairs at rest."""
+        found = [*reversed_pairs(contents.vectors), *still(contents.vectors), *other_scales(contents.vectors)]
         for warning in found:
             log.warning("%s", warning.sentence)
         return found

@@ -71,6 +71,7 @@ class Code(enum.Enum):
     REPEATED = "repeated"
     UNSEEDED = "unseeded"
     REVERSED = "reversed"
+    STILL = "still"
     OTHER_SCALE = "other_scale"
     FEW_VECTORS = "few_vectors"
     CROWDED = "crowded"
@@ -303,6 +304,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.REVERSED: (
         "the flow runs against {others}: unless it turned, the frames of a pair are exchanged in every camera. Check "
         "the order of its images"
+    ),
+    Code.STILL: (
+        "particles move by at most {voxel:.2g} voxel, vectors are uncertain by {uncertainty:.2g} voxel: both "
+        "frames show the same exposure, or the time between them is too short for this flow. Compare both frames"
     ),
     Code.OTHER_SCALE: (
         "the counts relative to {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, exposure, "

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+from support.pair_figures import pair_figures as figures_like
 
 import lfpiv
 from lfpiv.calibration.camera import Calibration
 from lfpiv.runs import belonging, pair_figures, pipeline
 from lfpiv.runs.frame_light import frame_light, read_darks
 from lfpiv.runs.moved_cameras import ShownParticles
-from lfpiv.runs.reversed_pairs import reversed_pairs
+from lfpiv.runs.reversed_pairs import reversed_pairs, still
 from lfpiv.selfcalibration.belonging import ImageFit, Judgement, judge
 from lfpiv.selfcalibration.mistakes import FLIPS, Kind, Mistake
 from lfpiv.warn import Code
@@ -250,6 +251,14 @@ def test_a_pair_whose_flow_runs_against_the_others_is_named(count, scatter):
     assert (
         found.pairs == ((0, 1) if count == 2 else (wrong,)) and "the frames of a pair are exchanged" in found.sentence
     )
+
+
+def test_runs_in_which_nothing_moves_are_told():
+    rest = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0004] * 24, uncertainty_voxel=0.05)
+    jet = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0] * 23 + [0.3], uncertainty_voxel=0.05)
+    (found,) = still({0: rest, 1: rest})
+    assert "at most 0.001 voxel" in found.sentence and "the same exposure" in found.sentence
+    assert not still({0: rest, 1: jet}) and not still({0: figures_like(0.0)})
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 60])
