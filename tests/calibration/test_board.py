@@ -531,6 +531,9 @@ def test_a_hidden_edge_is_refused_and_a_hidden_middle_is_not():
         require_stated(find_extents(found, in_view, (7, 7)), found)
     found, in_view = seen_board((7, 7), (7, 7), ALL, hidden=(3,))
     require_stated(find_extents(found, in_view, (7, 7)), found)
+    found, in_view = seen_board((5, 7), (7, 5), ALL, (1, -1))
+    with pytest.raises(InputError, match="turn this camera's pictures by 90 degrees"):
+        require_stated(find_extents(found, in_view, (7, 5)), found)
 
 
 def test_bad_boards_are_refused():

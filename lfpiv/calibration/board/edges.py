@@ -132,10 +132,12 @@ def require_stated(extents: tuple[Extent, Extent], found: np.ndarray, apart: flo
             f"found {apart:.1f}: it sees the board at so flat an angle, or with so coarse lenses, that a dot is not "
             f"told from the next, and {seen} seem to be there ({_per_plane(found)}). Use a board with a larger spacing."
         )
+    turned = [columns, rows] == [extent.stated for extent in reversed(extents)]
+    remedy = "turn this camera's pictures by 90 degrees if other cameras see them so" if turned else "uncover its edge"
     raise InputError(
         f"board.dots: expected the {stated} dots stated (columns x rows), found {seen}, and no dots beyond them where "
-        f"the camera would see some ({_per_plane(found)}). Set dots = [{columns}, {rows}], or uncover the board's "
-        "edge: all dots get wrong names if their stated number is wrong."
+        f"the camera would see some ({_per_plane(found)}). Set dots = [{columns}, {rows}], or {remedy}: all dots get "
+        "wrong names if their stated number is wrong."
     )
 
 
