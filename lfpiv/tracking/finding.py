@@ -166,7 +166,7 @@ class ParticleSearch:
             new = self._new(fit) if number else self._nothing
             if number and not len(new):
                 break
-            before, count = None if fit.normal is None else fit.residual, len(fit.cloud)
+            before, count = fit.residual if number else None, len(fit.cloud)
             fit.cloud = fit.cloud.joined(new)
             if not self._round(fit, number):
                 break
@@ -213,10 +213,7 @@ class ParticleSearch:
 
     def particles(self, fit: Fit) -> FoundParticles:
         """Return the particles of a fit that all cameras which see them confirm, with standard errors and figures."""
-        every = FoundParticles.of(
-            self.weights.cameras, self._grid, fit.model, fit.scene, fit.cloud, fit.normal, fit.scatter
-        )
-        return every[self.reported(fit)]
+        return FoundParticles.of(self.weights.cameras, self._grid, fit)[self.reported(fit)]
 
     def reported(self, fit: Fit) -> np.ndarray:
         """Return the numbers of the particles of a fit that `particles` returns."""
@@ -283,7 +280,6 @@ class ParticleSearch:
         if not len(fit.cloud):
             return False
         fit.refine(1)
-        assert fit.normal is not None
         fit.scatter = light_scatter(fit.normal, fit.cloud.light, fit.scatter)
         if self.sigma_voxel is None and number < SIZED_ROUNDS:
             fit_size(fit)
@@ -294,7 +290,6 @@ class ParticleSearch:
 
     def _follow_lines(self, fit: Fit) -> None:
         """Move particles that a camera does not confirm along the line of sight of one that shows them."""
-        assert fit.normal is not None
         alone = ~self._confirmed(fit)
         if alone.any():
             fit.cloud = follow_lines(fit.model, fit.scene, fit.cloud, fit.normal, alone)
@@ -315,7 +310,6 @@ class ParticleSearch:
 
     def _new(self, fit: Fit) -> Cloud:
         """Return candidates from the light that the particles leave."""
-        assert fit.normal is not None
         left = self._by_camera(fit.scene.residual(fit.normal.model))
         volume = candidates.reconstructed(self.weights, left, fit.noise, candidates.RESIDUAL_ITERATIONS)
         if volume is None:
@@ -332,7 +326,6 @@ class ParticleSearch:
         removed, so that their light may give others. With `splits`, two take the place of one where that explains more.
         """
         cloud, normal = fit.cloud, fit.normal
-        assert normal is not None
         found = confirmation.signals(normal, fit.scatter)
         misfit, lacking = confirmation.misfits(fit.model, fit.scene, cloud, normal)
         fit.error = confirmation.model_error(misfit, found)
@@ -346,7 +339,6 @@ class ParticleSearch:
 
     def _confirmed(self, fit: Fit) -> np.ndarray:
         """Return the particles that all cameras which see them show, shape (particle,), bool."""
-        assert fit.normal is not None
         found = confirmation.signals(fit.normal, fit.scatter)
         shown = confirmation.shown(fit.normal, found, fit.error, self._least(fit.cloud))
         return (shown | ~found.seen).all(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,17 +41,16 @@ class Fit:
     """Relative scatter of light between the cameras."""
     error: float = 0.0
     """Relative error of the model of a particle's image."""
-    normal: Normal | None = None
+    normal: Normal = field(init=False, repr=False)
+    """Equations of the particles, linearised by `refine`."""
 
     @property
     def residual(self) -> np.ndarray:
         """What the particles leave of the images [counts], shape (pixel,)."""
-        assert self.normal is not None
         return self.scene.residual(self.normal.model)
 
     def gain(self, before: np.ndarray) -> float:
         """Return how far the squares of the residuals, in units of noise, have fallen from `before`."""
-        assert self.normal is not None
         fallen = np.square(before) - np.square(self.residual)
         return float((fallen / self.scene.variance(self.normal.model)).sum(dtype=np.float64))
 
@@ -63,7 +62,6 @@ class Fit:
 
     def surround(self) -> None:
         """Measure the background again, where the model of the particles is dark."""
-        assert self.normal is not None
         counts, variance = [], []
         for number, (name, image) in enumerate(self.images.items()):
             span = slice(*self.model.first_pixel[number : number + 2])

@@ -11,8 +11,8 @@ import numpy as np
 from lfpiv.geometry.grid import Grid
 from lfpiv.geometry.volume import lies_in
 from lfpiv.tracking.confirmation import signals
-from lfpiv.tracking.particle_images import ParticleImages
-from lfpiv.tracking.refinement import Cloud, Normal, Scene, covariances, overlaps
+from lfpiv.tracking.fit import Fit
+from lfpiv.tracking.refinement import Normal, covariances, overlaps
 
 if TYPE_CHECKING:
     from lfpiv.calibration.camera import CalibratedCamera
@@ -58,22 +58,10 @@ class FoundParticles:
         return replace(self, **arrays)
 
     @classmethod
-    def of(
-        cls,
-        cameras: Mapping[str, CalibratedCamera],
-        grid: Grid,
-        model: ParticleImages,
-        scene: Scene,
-        cloud: Cloud,
-        normal: Normal | None,
-        scatter: float,
-    ) -> FoundParticles:
-        """Return the particles with their figures.
-
-        `grid` is the volume that their density refers to, `scatter` that of light between cameras.
-        """
-        count = len(cloud)
-        if normal is None or not count:
+    def of(cls, cameras: Mapping[str, CalibratedCamera], grid: Grid, fit: Fit) -> FoundParticles:
+        """Return the particles of a fit with their figures; `grid` is the volume that their density refers to."""
+        model, scene, cloud = fit.model, fit.scene, fit.cloud
+        if not len(cloud):
             empty = np.zeros((0, 3))
             return cls(
                 positions_mm=empty,
@@ -88,12 +76,12 @@ class FoundParticles:
                 per_microlens=0.0,
                 signal_to_noise=np.zeros(0),
             )
+        normal = fit.normal
         errors = np.sqrt(np.maximum(np.einsum("pii->pi", covariances(normal))[:, :3], 0)) * grid.voxel_mm
-        residual = _residuals(model, scene, cloud, normal)
-        left = scene.residual(normal.model)
+        residual = _residuals(fit)
         noise = float(scene.variance(normal.model).sum(dtype=np.float64))
         whole = float(np.square(scene.counts, dtype=np.float64).sum()) - noise
-        explained = 1 - (float(np.square(left, dtype=np.float64).sum()) - noise) / whole if whole > 0 else 0.0
+        explained = 1 - (float(np.square(fit.residual, dtype=np.float64).sum()) - noise) / whole if whole > 0 else 0.0
         return cls(
             positions_mm=cloud.positions_mm,
             errors_mm=errors * np.maximum(residual, 1)[:, None],
@@ -105,12 +93,13 @@ class FoundParticles:
             crowding=_crowding(normal),
             hidden=_hidden(normal),
             per_microlens=int(lies_in(cloud.positions_mm, grid).sum()) / _microlenses(cameras, grid),
-            signal_to_noise=signals(normal, scatter).ratio,
+            signal_to_noise=signals(normal, fit.scatter).ratio,
         )
 
 
-def _residuals(model: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal) -> np.ndarray:
-    square = np.square(scene.residual(normal.model)) / scene.variance(normal.model)
+def _residuals(fit: Fit) -> np.ndarray:
+    model, cloud = fit.model, fit.cloud
+    square = np.square(fit.residual) / fit.scene.variance(fit.normal.model)
     above, below = np.zeros(len(cloud)), np.zeros(len(cloud))
     for camera, own in enumerate(model.lists(cloud.positions_mm)):
         particle = np.repeat(np.arange(len(cloud)), np.diff(own.first))

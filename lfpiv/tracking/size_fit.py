@@ -43,7 +43,6 @@ def fit_size(fit: Fit) -> None:
 
 def _better_size(fit: Fit) -> ParticleImages:
     """Return the model with the size that explains the images of clear particles best, from three sizes."""
-    assert fit.normal is not None
     clear, weak = _clear(fit.normal, fit.cloud.light)
     cloud, explained = fit.cloud[clear], fit.cloud[np.concatenate([clear, weak])]
     own = rendered(fit.model, fit.model.lists(cloud.positions_mm), cloud.light)

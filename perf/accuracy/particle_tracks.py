@@ -13,6 +13,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
@@ -46,7 +47,7 @@ def links_of(search: ParticleSearch, fits: Sequence[Fit]) -> list[xr.Dataset]:
     """Return the links of successive instants."""
     tables = []
     for pair in pairwise(fits):
-        first, second = exchange(search, [replace(fit) for fit in pair], spread_voxel=SPREAD_VOXEL)
+        first, second = exchange(search, [copy(fit) for fit in pair], spread_voxel=SPREAD_VOXEL)
         tables.append(link_particles(first, second, dt_s=1.0, spread_voxel=SPREAD_VOXEL))
     return tables
 

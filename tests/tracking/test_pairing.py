@@ -1,6 +1,6 @@
 """A particle that is found in a single frame is looked for in the other one; candidates are confirmed."""
 
-from dataclasses import replace
+from copy import copy
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def fitted(device):
 
 def test_lost_particles_come_back_and_absent_ones_do_not(fitted):
     search, first, _, fits = fitted
-    fits = [replace(one) for one in fits]
+    fits = [copy(one) for one in fits]
     places = first[1:] + SHIFT_MM
     lost = match_particles(fits[1].cloud.positions_mm, places[:1], VOXEL_MM)
     assert len(lost) == 1
@@ -40,7 +40,7 @@ def test_lost_particles_come_back_and_absent_ones_do_not(fitted):
 def test_too_few_links_leave_both_frames_as_they_are(fitted):
     search, _, images, fits = fitted
     dark = search.fit({name: 0 * one for name, one in images[0].items()}, noise=READ_NOISE)
-    first, second = exchange(search, [replace(fits[0]), dark])
+    first, second = exchange(search, [copy(fits[0]), dark])
     assert len(first) == COUNT and len(second) == 0
 
 
