@@ -57,14 +57,17 @@ def true_points(plane_errors, dot_errors, board=BOARD):
     return np.concatenate(points)
 
 
-def labels(angle, optics, points, rng, board=BOARD, wrong=0):
-    """Labels of all dots at `points`; `wrong` dots carry the label of a place that is 0.8 mm away."""
+def labels(angle, optics, points, rng, board=BOARD, wrong=0, along_s=1.0):
+    """Labels of all dots at `points`; `wrong` dots carry the label of a place that is 0.8 mm away.
+
+    Their noise is `along_s` times larger along s than along t.
+    """
     scene_camera = camera(angle, optics)
     radius, count = scene_camera.optics.pupil_radius_mm, len(points)
     dot = np.repeat(np.arange(count), 37)
     length, turn = radius * np.sqrt(rng.random(len(dot))), 2 * np.pi * rng.random(len(dot))
     pupil = np.stack([length * np.cos(turn), length * np.sin(turn)], axis=1)
-    noise = NOISE_MM * rng.standard_normal((count, 3, 2))[dot]
+    noise = NOISE_MM * np.array([along_s, 1.0]) * rng.standard_normal((count, 3, 2))[dot]
     array = true_mapping(scene_camera)(points[dot], pupil)
     array += noise[:, 0] + noise[:, 1] * pupil[:, :1] / radius + noise[:, 2] * pupil[:, 1:] / radius
     array[np.isin(dot, rng.choice(count, wrong, replace=False))] += 0.8
@@ -80,9 +83,9 @@ def labels(angle, optics, points, rng, board=BOARD, wrong=0):
     return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=radius, pitch_mm=0.1)
 
 
-def fitted(points, angles, optics="ideal", seed=0, board=BOARD, wrong=0):
+def fitted(points, angles, optics="ideal", seed=0, board=BOARD, **faults):
     rng = np.random.default_rng(seed)
-    return fit_board([labels(angle, optics, points, rng, board, wrong) for angle in angles], board)
+    return fit_board([labels(angle, optics, points, rng, board, **faults) for angle in angles], board)
 
 
 def left_mm(found, true, board=BOARD):
@@ -105,6 +108,14 @@ def test_a_perfect_board_is_not_corrected(cameras, optics):
     assert found.corrected == ()
     assert not found.plane.any() and not found.dot_mm.any()
     assert (found.plane_std[:, 2] > 0).all()  # what the labels could have shown
+
+
+@pytest.mark.parametrize("cameras", ANGLES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_perfect_board_is_not_corrected_where_dots_are_seen_worse_along_rows(cameras, seed):
+    """Dots of a row a whole number of lenses apart, each within a lens, show little of their place along the row."""
+    found = fitted(true_points(*errors_of(np.random.default_rng(0))), ANGLES[cameras], seed=seed, along_s=8.0)
+    assert found.corrected == ()
 
 
 @pytest.mark.slow(but="two cameras-aberrated")

@@ -162,28 +162,28 @@ class Equations:
 class WeightedEquations:
     """Equations of one camera with weights, after the smooth terms are eliminated."""
 
-    root: np.ndarray  # square root of the weights [1/mm], (rows,)
-    basis: np.ndarray  # orthonormal basis of the weighted smooth terms, (rows, terms)
+    bases: tuple[np.ndarray, ...]  # for s and t: orthonormal basis of the weighted smooth terms, (rows, terms)
     effects: np.ndarray  # (2, rows, size)
     departure: np.ndarray  # (2, rows)
 
     @classmethod
     def of(cls, system: Equations, noise: np.ndarray, robust: np.ndarray) -> WeightedEquations:
-        """Weight by the noise of chief rays and slopes [mm], and by the robust weights of the rows."""
-        of_kind = np.append(noise, np.maximum(noise, system.least_mm))
-        root = np.sqrt(robust / system.variance) / of_kind[system.kind]
-        left, strength, _ = np.linalg.svd(system.smooth * root[:, None], full_matrices=False)
-        basis = left[:, strength > RANK_TOLERANCE * strength[0]]
-        return cls(
-            root=root,
-            basis=basis,
-            effects=np.stack([without(basis, part * root[:, None]) for part in system.effects]),
-            departure=np.stack([without(basis, part * root) for part in system.departure]),
-        )
+        """Weight by the noise of chief rays and slopes along s and t [mm], (2, 2), and the rows' robust weights."""
+        roots, bases = [], []
+        for along in noise.T:
+            of_kind = np.append(along, np.maximum(along, system.least_mm))
+            root = np.sqrt(robust / system.variance) / of_kind[system.kind]
+            left, strength, _ = np.linalg.svd(system.smooth * root[:, None], full_matrices=False)
+            roots.append(root)
+            bases.append(left[:, strength > RANK_TOLERANCE * strength[0]])
+        effects = [without(*part) for part in zip(bases, system.effects * np.stack(roots)[..., None], strict=True)]
+        departure = [without(*part) for part in zip(bases, system.departure * roots, strict=True)]
+        return cls(bases=tuple(bases), effects=np.stack(effects), departure=np.stack(departure))
 
     def residual(self, solution: Solution) -> np.ndarray:
         """Return the residuals in standard deviations, freed of the part that the unknowns take, shape (2, rows)."""
-        taken = (self.basis**2).sum(1) + ((self.effects @ solution.covariance) * self.effects).sum(2)
+        of_terms = np.stack([(basis**2).sum(1) for basis in self.bases])
+        taken = of_terms + ((self.effects @ solution.covariance) * self.effects).sum(2)
         rest = self.departure - self.effects @ solution.values
         return rest / np.sqrt(np.maximum(1 - taken, LEAST_FREEDOM))
 
@@ -199,7 +199,7 @@ class _Fit:
 
 def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardErrors) -> _Fit:
     """Fit the errors of the board with robust weights, and keep the kinds of errors that are significant."""
-    noise = [np.full(2, FIRST_NOISE_MM) for _ in equations]
+    noise = [np.full((2, 2), FIRST_NOISE_MM) for _ in equations]  # of chief rays and slopes, along s and t
     robust = [np.ones(len(camera.variance)) for camera in equations]
     std: dict[str, float] = dict(FIRST_STD)
     for _ in range(ROUNDS):
@@ -210,10 +210,10 @@ def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardE
         solution = normal.solve(std)
         for k, (camera, of) in enumerate(zip(equations, weighted, strict=True)):
             residual = np.abs(of.residual(solution)) / np.sqrt(robust[k])
-            scatter = [NORMAL_MAD * float(np.median(residual[:, camera.kind == kind])) for kind in range(2)]
+            scatter = [NORMAL_MAD * np.median(residual[:, camera.kind == kind], axis=1) for kind in range(2)]
             scale = np.maximum(scatter, LEAST_NOISE_MM / noise[k])
             noise[k] = noise[k] * scale
-            robust[k] = _robust_weights(residual / np.append(scale, [1.0, 1.0])[camera.kind], camera.kind)
+            robust[k] = _robust_weights(residual / np.vstack([scale, np.ones((2, 2))])[camera.kind].T, camera.kind)
     kept = normal.significant_std(std)
     values = normal.solve(kept).values
     effects = effects.as_most_planes(values, board.planes_mm)
