@@ -18,7 +18,7 @@ from scipy import ndimage
 from lfpiv.geometry.names import COMPONENTS
 from lfpiv.quantities import significant
 from lfpiv.report.flow import IN_SLICE, Quantity
-from lfpiv.report.svg import arrows, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
+from lfpiv.report.svg import arrows, cell_edges, colour_bar, image_panel, spread_ticks, style, to_svg
 
 MOST_SLICES = 5
 """Largest number of slices of a vector field."""
@@ -80,17 +80,10 @@ def slice_panel(
     good = like["valid"].values & np.isfinite(like["u"].values)
     slab = fields.isel({normal: place}).transpose(up, across)
     edges = [cell_edges(slab[axis].values) for axis in (across, up)]
-    spans = [high - low for low, high in edges]
-    figure, axes = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
-    low, high = limits(like[quantity].values[good], kinds[quantity])
-    shown = axes.imshow(
-        _smooth(np.where(slab["masked"].values, np.nan, slab[quantity].values)),
-        cmap="RdBu_r" if kinds[quantity].signed else "viridis",
-        norm=Normalize(low, high),
-        extent=(*edges[0], *edges[1]),
-        origin="lower",
-        interpolation="none",
-    )
+    values = _smooth(np.where(slab["masked"].values, np.nan, slab[quantity].values))
+    colours = "RdBu_r" if kinds[quantity].signed else "viridis"
+    ends = limits(like[quantity].values[good], kinds[quantity])
+    figure, axes, shown = image_panel(values, edges, colours, Normalize(*ends))
     _hatch(axes, slab["masked"].values, edges)
     named = f"{title}, " if title else ""
     title = f"{named}{normal} = {float(slab[normal]):.2f} mm".replace("-", "−")

@@ -11,6 +11,7 @@ import html
 import io
 import itertools
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -19,7 +20,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.path import Path
 
 INK = "#7b8a91"
@@ -29,6 +32,8 @@ SERIES = ("#2f81d7", "#e0762b", "#2ca36c", "#c24790", "#8a6fd2", "#9a8d2b")
 
 WIDTH_INCH = 3.6
 """Width of a panel [inch]: 346 CSS pixels, the text width on a phone."""
+IMAGE_WIDTH_INCH, IMAGE_HEIGHTS_INCH, AROUND_IMAGE_INCH = 3.05, (0.5, 3.6), 1.35
+"""Width of an image in a panel, least and largest height, and height of its title, labels and colour bar [inch]."""
 TEXT_POINT, SMALL_POINT = 9.0, 8.5
 """Sizes of titles and labels, and of tick labels [point]."""
 
@@ -45,6 +50,18 @@ def new_panel(height_inch: float = 2.6) -> tuple[Figure, Any]:
     FigureCanvasSVG(figure)
     figure.patch.set_alpha(0)
     return figure, figure.subplots()
+
+
+def image_panel(
+    values: np.ndarray, edges: Sequence[tuple[float, float]], cmap: str, norm: Normalize
+) -> tuple[Figure, Any, AxesImage]:
+    """Create a panel with an image of cells (up, across) between their ends (across, up), to scale."""
+    (left, right), (bottom, top) = edges
+    height_inch = float(np.clip(IMAGE_WIDTH_INCH * (top - bottom) / (right - left), *IMAGE_HEIGHTS_INCH))
+    figure, axes = new_panel(height_inch + AROUND_IMAGE_INCH)
+    extent = (left, right, bottom, top)
+    shown = axes.imshow(values, cmap=cmap, norm=norm, extent=extent, origin="lower", interpolation="none")
+    return figure, axes, shown
 
 
 def style(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "", legend: bool = False) -> None:

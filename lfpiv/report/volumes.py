@@ -15,7 +15,7 @@ from lfpiv.report import markup
 from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
 from lfpiv.report.summary import PairFigures
-from lfpiv.report.svg import INK, SERIES, cell_edges, colour_bar, new_panel, spread_ticks, style, to_svg
+from lfpiv.report.svg import INK, SERIES, cell_edges, colour_bar, image_panel, new_panel, spread_ticks, style, to_svg
 from lfpiv.results import netcdf
 
 FEW_VOLUMES = 6
@@ -96,16 +96,7 @@ def _projection_figure(pair: int, first: xr.Dataset, recording: Recording) -> st
 def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float) -> str:
     values = first[f"projection_{along}"].isel(frame=0).transpose(up, across).values
     edges = [cell_edges(first[axis].values) for axis in (across, up)]
-    spans = [high - low for low, high in edges]
-    figure, axes = new_panel(float(np.clip(3.05 * spans[1] / spans[0], 0.5, 3.6)) + 1.35)
-    shown = axes.imshow(
-        values,
-        cmap="magma",
-        norm=Normalize(0, top),
-        extent=(*edges[0], *edges[1]),
-        origin="lower",
-        interpolation="none",
-    )
+    figure, axes, shown = image_panel(values, edges, "magma", Normalize(0, top))
     style(axes, title=f"along {along}", xlabel=f"{across} [mm]", ylabel=f"{up} [mm]")
     spread_ticks(axes)
     colour_bar(figure, shown, axes, "largest intensity [counts]", location="bottom")
