@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trame_client.widgets.html as html
@@ -13,11 +13,15 @@ from trame_client.widgets.core import AbstractElement
 
 from lfpiv.experiment.opening import read_experiment
 from lfpiv.studio import charts, controls
-from lfpiv.studio.raw_images import MOST_MARKS, RawImages
 from lfpiv.studio.session import NO_EXPERIMENT, Session, sent
+
+if TYPE_CHECKING:
+    from lfpiv.studio.raw_images import RawImages
 
 LATTICE, DOT, ARROW, X_AXIS, Y_AXIS = "#37b24d", "#ffd43b", "#ff6b6b", "#ff6b6b", "#4dabf7"
 MARKED = {"saturated": "#ff922b", "hot": "#e64980"}
+MOST_MARKS = 3000
+"""Largest number of pixels, dots or lenses that are marked."""
 
 
 class Picture(AbstractElement):  # type: ignore[misc]  # trame has no types
@@ -63,6 +67,8 @@ class Images:
         if path is None or self.raw is not None or self.state.tab != "images" or self.state.i_busy:
             return
         with self.session.busy("i_busy", "reading the experiment"):
+            from lfpiv.studio.raw_images import RawImages  # late: its libraries would delay the first picture
+
             self.raw = raw = RawImages(await asyncio.to_thread(read_experiment, path), self.session.results)
         with self.state as s:
             s.i_cameras = [setup.name for setup in raw.experiment.cameras]

@@ -51,7 +51,8 @@ def build(given: Path) -> Session:
         _bar(session)
         with v3.VMain():
             for name, (_, tab) in TABS.items():
-                with html.Div(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
+                # what a hidden tab shows is built when it is first seen
+                with v3.VLazy(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
                     tab(session)
         with v3.VSnackbar(
             "{{ message }}", v_model=("message_shown",), timeout=30000, multi_line=True, location="bottom",

@@ -32,8 +32,6 @@ KEPT_IMAGES = 3
 """Images, and what is seen in them, that are kept."""
 MOST_LISTED = 1000
 """Largest number of frames of particles that are listed."""
-MOST_MARKS = 3000
-"""Largest number of pixels, dots or lenses that are marked."""
 ARROW_GAIN = 50.0
 """Factor by which residuals of dots are drawn longer than they are."""
 REFOCUSED = 100
