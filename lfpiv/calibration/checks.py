@@ -24,6 +24,7 @@ from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment, white_level
+from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.image_checks import (
     APERTURE,
@@ -183,8 +184,10 @@ def compare_with_nominal(
     depth = float(fitted.rotation[2] @ -fitted.offset_mm)  # of the middle of the board
     magnification = fitted.image_distance_mm / (fitted.object_distance_mm - depth)
     ratio = magnification * setup.optics.object_distance_mm / setup.optics.image_distance_mm
-    if turn > TURN_DEG:
-        figures = {"turn_deg": float(turn), "nominal": str(stated)}
+    if stated is not None and turn > TURN_DEG:
+        axis = Orientation.from_direction(rotation[2])
+        axis = Orientation(round(axis.yaw_deg), round(axis.pitch_deg))
+        figures = {"turn_deg": float(turn), "nominal": f"{stated}; its axis stands {axis}"}
         warn(log, Warning(code=Code.TURNED, subject=setup.name, figures=figures))
     if surface is not None:
         warn(log, Warning(code=Code.MEDIUM, subject=setup.name, figures=_medium(surface.index)))

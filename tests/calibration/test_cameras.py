@@ -300,6 +300,14 @@ def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(r
     assert camera.report.sigma_nor_stated > 10 * camera.report.sigma_nor_test  # the stage's part and the lens's
 
 
+def test_an_angle_in_radians_is_shown_beside_the_fitted_one(rig):
+    experiment, _, calibration = rig
+    setup = dataclasses.replace(experiment.cameras[0], orientation=Orientation(np.radians(-30.0)))
+    with warn.collected() as found:
+        checks.compare_with_nominal(setup, calibration.cameras["only"].baseline, 0.0)
+    assert found[0].code is Code.TURNED and "at -0.523599°; its axis stands in the direction" in found[0].sentence
+
+
 def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
     """Six training dots have many labels, but contribute only the values of six ray models."""
     experiment, _, calibration = rig
