@@ -25,10 +25,6 @@ def microimage_centres(optics: Optics, lattice: LensLattice, margin_px: float) -
 
     Parameters
     ----------
-    optics : Optics
-        The camera.
-    lattice : LensLattice
-        Its microlenses.
     margin_px : float
         Margin around the sensor in which centres are returned as well [pixel].
 

@@ -95,8 +95,6 @@ def light_beyond(
     ----------
     calibration : Calibration
         Cameras. With one camera nothing can be measured.
-    grid : Grid
-        The volume.
     pairs : sequence of sequence of dict
         Particle images of some frames, in groups of frames that show the same particles, such as the frames of a
         pair: camera name -> image (rows, columns), background removed [counts].

@@ -128,8 +128,6 @@ class SubApertures:
 
     Parameters
     ----------
-    camera : CalibratedCamera
-        Optics and lattice.
     even : ndarray, shape (rows, columns)
         Image of an evenly lit volume.
     """

@@ -35,8 +35,6 @@ def measure_size(calibration: Calibration, grid: Grid, images: Sequence[Mapping[
 
     Parameters
     ----------
-    calibration : Calibration
-        Cameras.
     grid : Grid
         The volume. The weights of its middle, at most `LARGEST_PART` voxels along each axis, are built, and those of as
         many coarse voxels for the light of the whole.

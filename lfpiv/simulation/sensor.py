@@ -91,8 +91,6 @@ def draw_pattern(sensor: Sensor, shape: tuple[int, int], rng: np.random.Generato
 
     Parameters
     ----------
-    sensor : Sensor
-        Its table.
     shape : (int, int)
         Rows and columns.
     rng : Generator

@@ -72,8 +72,6 @@ def signals(normal: Normal, scatter: float) -> Signals:
 
     Parameters
     ----------
-    normal : Normal
-        Linearised equations.
     scatter : float
         Scatter of light between cameras that they assume.
     """
@@ -154,8 +152,6 @@ def shown(normal: Normal, found: Signals, error: float, least: float, part: floa
 
     Parameters
     ----------
-    normal : Normal
-        Linearised equations.
     found : Signals
         Light in units of noise.
     error : float
@@ -186,10 +182,6 @@ def merged(normal: Normal, cloud: Cloud, good: np.ndarray, position_error: np.nd
 
     Parameters
     ----------
-    normal : Normal
-        Linearised equations.
-    cloud : Cloud
-        Particles.
     good : ndarray, shape (particle,), bool
         Particles to keep.
     position_error : ndarray, shape (particle, 3)

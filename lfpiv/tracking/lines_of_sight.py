@@ -91,12 +91,6 @@ def follow_lines(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Nor
     ----------
     images : ParticleImages
         Model of the images.
-    scene : Scene
-        The images.
-    cloud : Cloud
-        All particles.
-    normal : Normal
-        Their equations.
     chosen : ndarray, shape (particle,), bool
         Particles that some camera which sees them does not confirm.
 

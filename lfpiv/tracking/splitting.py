@@ -40,12 +40,6 @@ def split(images: ParticleImages, scene: Scene, cloud: Cloud, normal: Normal, ch
     ----------
     images : ParticleImages
         Model of the images.
-    scene : Scene
-        The images.
-    cloud : Cloud
-        All particles.
-    normal : Normal
-        Their equations.
     chosen : ndarray, shape (particle,), bool
         Particles to replace.
 

@@ -31,8 +31,6 @@ def track_table(followed: TrackedParticles, *, voxel_mm: float, dt_s: float) -> 
 
     Parameters
     ----------
-    followed : TrackedParticles
-        Particles by track.
     voxel_mm : float
         Edge of a voxel [mm].
     dt_s : float

@@ -63,8 +63,6 @@ def fit_neighbours(
         Windows whose values enter.
     offsets : ndarray, shape (z, y, x, 3)
         Place of each value relative to the centre of its window [voxel].
-    windows : Windows
-        The grid.
     chosen : ndarray of bool, shape (z, y, x)
         Windows for which a function is fitted.
     """
@@ -108,8 +106,6 @@ def continued(
         Windows that were measured.
     fluid : array of bool
         Voxels with fluid, of the volume's shape.
-    windows : Windows
-        The grid.
     """
     share, result = windows.means(fluid), field.copy()
     offsets = fluid_centroids(fluid, windows)

@@ -73,8 +73,6 @@ class MemoryLeft:
     ----------
     cameras : collection of CalibratedCamera
         All cameras of the grid.
-    grid : Grid
-        The voxels.
     limit_bytes : float
         Memory that the weights may take on the host [byte]; default: no limit.
     """

@@ -147,8 +147,6 @@ def give_light(
     ----------
     guess, column_sum : array, shape (voxel,), float32
         The volume, above 0 where voxels are lit, and the sum of each voxel's weights with gain.
-    comparisons : sequence of Comparison
-        The images.
     shown : sequence of array, shape (lit pixel,), float32
         1 for pixels that a lit voxel lights, else 0, of each image.
     """

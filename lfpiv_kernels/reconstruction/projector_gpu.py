@@ -140,11 +140,6 @@ def _write_entries(
 
 class TiledProjector:
     """The weights of one camera as a GPU reads them, and the light on its rays. Rows of rays begin sectors.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        The weights.
     """
 
     def __init__(self, blocks: Blocks):

@@ -124,8 +124,6 @@ def agreeing_dots(dots: BoardDots, departure_mm: np.ndarray, pitch_mm: float) ->
 
     Parameters
     ----------
-    dots : BoardDots
-        The labels.
     departure_mm : ndarray, shape (n, 2)
         Each label minus the ray of a fitted thin lens [mm].
     pitch_mm : float

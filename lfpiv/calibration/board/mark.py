@@ -65,8 +65,6 @@ def name_by_mark(found: np.ndarray, in_view: np.ndarray, board: DotBoard) -> Nam
     ----------
     found, in_view : ndarray of bool, shape (plane, n, n)
         Sites with a dot, and sites whose dot would be fully in view. The lattice's middle is site (n - 1) / 2.
-    board : DotBoard
-        The marked board.
 
     Raises
     ------

@@ -73,8 +73,6 @@ def count_blocks(
 
     Parameters
     ----------
-    stored : StoredGrid
-        The voxels.
     rays : int
         Rays per voxel: a power of 2, at most ``counted_blocks.MOST_RAYS``.
     progress : callable

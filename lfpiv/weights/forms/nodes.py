@@ -109,8 +109,6 @@ def choose_nodes(
 
     Parameters
     ----------
-    stored : StoredGrid
-        The voxels.
     form : {"profiles", "pixels"}
         Form of the weights.
     cuts : tuple of int
