@@ -77,16 +77,11 @@ def places(record, path=()):
         yield from places(value, (*path, key))
 
 
-def without(record, path):
-    copy = json.loads(json.dumps(record))
-    inner = copy
-    for key in path[:-1]:
-        inner = inner[key]
-    del inner[path[-1]]
-    return copy
+REMOVED = object()
 
 
 def exchanged(record, path, value):
+    """Return a copy of a nested record with another value at a place, or none if it is `REMOVED`."""
     if not path:
         return value
     copy = json.loads(json.dumps(record))
@@ -94,6 +89,8 @@ def exchanged(record, path, value):
     for key in path[:-1]:
         inner = inner[key]
     inner[path[-1]] = value
+    if value is REMOVED:
+        del inner[path[-1]]
     return copy
 
 
@@ -102,7 +99,7 @@ def mutations(draw, record):
     """Draw a record of which one entry is another value or missing."""
     path = draw(st.sampled_from(list(places(record))))
     if path and draw(st.booleans()):
-        return without(record, path)
+        return exchanged(record, path, REMOVED)
     return exchanged(record, path, draw(VALUES))
 
 

@@ -139,8 +139,7 @@ def _write_entries(
 
 
 class TiledProjector:
-    """The weights of one camera as a GPU reads them, and the light on its rays. Rows of rays begin sectors.
-    """
+    """The weights of one camera as a GPU reads them, and the light on its rays. Rows of rays begin sectors."""
 
     def __init__(self, blocks: Blocks):
         self._edge = blocks.microimages.edge

@@ -459,7 +459,6 @@ def test_weights_that_nothing_judges_say_so():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda w: lfpiv.build_weights(IdealRig(w.cameras), w.grid, method="exact"), "method: expected one of"),
         (lambda w: lfpiv.build_weights(IdealRig(w.cameras), w.grid, form="exact"), "form: expected one of"),
         (lambda w: lfpiv.build_weights(IdealRig(RIGS), w.grid, form="profiles"), "those of camera 'hexagonal'"),
         (lambda w: w(np.zeros(w.grid.shape), out={n: np.zeros(c.gain.shape) for n, c in w.cameras.items()}), "out"),
