@@ -260,8 +260,9 @@ SENTENCES: Mapping[Code, str] = {
         "are wrong by about as much; compare both frames of the camera where nothing moves"
     ),
     Code.NOTHING_IN_COMMON: (
-        "{names} show no particles in common within {search} voxels, so no vector is valid: a camera moved by more, "
-        "their images are of different instants, or show very few particles."
+        "{names} show no particles in common within {search} voxels, so no vector is valid: particles are lit outside "
+        "the volume (volume.centre_mm), a camera moved by more, or their images are of different instants or show very "
+        "few particles."
     ),
     Code.MISMATCHED: "{found}, as the particles show, so no vector is valid. {remedy}, and run again.",
     Code.NOT_SELF_CALIBRATED: (
