@@ -21,8 +21,8 @@ ALIKE = 0.8
 """Least likeness of a run's pairs, median of the magnitudes: a flow that fluctuates so much may turn."""
 LEAST_VALID = 0.5
 """Least share of valid vectors of a pair that is compared."""
-STILL = 0.5
-"""Movement over the median uncertainty of a pair's vectors, below which nothing moves: chance alone makes more."""
+STILL_VOXEL = 0.02
+"""Movement below which nothing moves [voxel]: ideal rigs have errors of as much."""
 FEW = 0.1
 """Largest share of reversed pairs, where it is more than one: a flow that oscillates has more."""
 
@@ -47,16 +47,15 @@ def reversed_pairs(figures: Mapping[int, PairFigures]) -> list[Warning]:
 
 
 def still(figures: Mapping[int, PairFigures]) -> list[Warning]:
-    """Return the warning that nothing moves by more than `STILL` uncertainties, in any pair or eighth of the volume."""
+    """Return the warning that nothing moves by `STILL_VOXEL`, in any pair or eighth of the volume; empty if it does."""
     moved = [
-        (max(one.moved_voxel, *np.abs(one.flow_voxel)), one.uncertainty_voxel)
+        max(one.moved_voxel, *np.abs(one.flow_voxel))
         for one in figures.values()
-        if one.moved_voxel is not None and one.flow_voxel is not None and one.uncertainty_voxel is not None
+        if one.moved_voxel is not None and one.flow_voxel is not None
     ]
-    if not moved or any(voxel >= STILL * uncertainty for voxel, uncertainty in moved):
+    if not moved or max(moved) >= STILL_VOXEL:
         return []
-    voxel, uncertainty = map(float, np.max(moved, axis=0))
-    return [Warning(code=Code.STILL, figures={"voxel": voxel, "uncertainty": uncertainty})]
+    return [Warning(code=Code.STILL, figures={"voxel": float(max(moved))})]
 
 
 def _likeness(pairs: Sequence[int], figures: Mapping[int, PairFigures]) -> dict[int, float]:

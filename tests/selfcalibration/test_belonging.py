@@ -254,8 +254,8 @@ def test_a_pair_whose_flow_runs_against_the_others_is_named(count, scatter):
 
 
 def test_runs_in_which_nothing_moves_are_told():
-    rest = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0004] * 24, uncertainty_voxel=0.05)
-    jet = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0] * 23 + [0.3], uncertainty_voxel=0.05)
+    rest = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0004] * 24)
+    jet = figures_like(1.0, moved_voxel=0.001, flow_voxel=[0.0] * 23 + [0.3])
     (found,) = still({0: rest, 1: rest})
     assert "at most 0.001 voxel" in found.sentence and "the same exposure" in found.sentence
     assert not still({0: rest, 1: jet}) and not still({0: figures_like(0.0)})
