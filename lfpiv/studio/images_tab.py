@@ -137,10 +137,8 @@ class Images:
             centres = raw.lattice_px(camera)
             radius = optics.pupil_radius_mm * optics.sensor_per_pupil / optics.pixel_mm
             marks.append(mark("circles", LATTICE, centres, radius=float(radius)))
-            apart = f"{optics.microimage_pitch_px:.2f} px apart (stated)"
-            facts.append(f"{len(centres):,} microimages on the lattice, {apart}")
-        found = raw.marked_pixels(camera, image)
-        for kind, places in found.items():
+            facts.append(f"{len(centres):,} microimages, {optics.microimage_pitch_px:.2f} px apart (stated)")
+        for kind, places in raw.marked_pixels(camera, image).items():
             facts.append(f"{len(places):,} {kind} pixels")
             if s.i_pixels and len(places):
                 marks.append(mark("circles", MARKED[kind], places[:MOST_MARKS], radius=2.0))

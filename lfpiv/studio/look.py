@@ -162,7 +162,7 @@ class Picture:
 
     def limits(self, grid: pv.ImageData, name: str) -> tuple[float, float]:
         """Return the ends of the colour scale of a field, which are computed once."""
-        return self._kept("limits", (id(grid), name), lambda: own_limits(grid, name))  # type: ignore[no-any-return]
+        return self._kept("limits", (id(grid), name), lambda: own_limits(grid, name))
 
     def _kept(self, name: str, key: Any, make: Any) -> Any:
         if self.drawn.get(f"{name} key") != key:

@@ -1,4 +1,4 @@
-"""The page: a bar with what is open, tabs, and messages. Tabs are built by their own modules."""
+"""The page: a bar with what is open, tabs, and messages. A tab has its own module, and is built when it is seen."""
 
 from __future__ import annotations
 
@@ -51,7 +51,6 @@ def build(given: Path) -> Session:
         _bar(session)
         with v3.VMain():
             for name, (_, tab) in TABS.items():
-                # what a hidden tab shows is built when it is first seen
                 with v3.VLazy(v_show=f"tab === '{name}'", classes="lf-tab", id=f"tab-{name}", role="tabpanel"):
                     tab(session)
         with v3.VSnackbar(
