@@ -140,6 +140,7 @@ class Equations:
         smooth = smooth_terms(data.rays, depth, data.lens)
         if smooth is None:
             return None
+        smooth = np.hstack([smooth, data.lens_terms()])
         moved = np.einsum("dkaj,djp->akdp", jacobian, effects.displacement(board, data.dot)).reshape(2, 3 * count, -1)
         departure = (data.rays - rays).transpose(2, 1, 0).reshape(2, -1) + moved @ values
         planes, plane = np.unique(data.dot // board.size, return_inverse=True)
@@ -154,7 +155,7 @@ class Equations:
             departure=np.pad(departure, ((0, 0), (0, stated))),
             variance=np.append(data.variance[:, [0, 1, 1]].T.ravel(), np.ones(stated)),
             kind=np.repeat([0, 1, 2, 3], [count, 2 * count, stated // 3, 2 * stated // 3]),
-            least_mm=PLANE_ERROR_PITCH * data.pitch_mm,
+            least_mm=PLANE_ERROR_PITCH * data.lattice.pitch_mm,
         )
 
 
