@@ -291,7 +291,7 @@ def calibrate_first(file):
 def test_a_white_image_of_another_place_is_refused(small_run, tmp_path):
     file = small_run.images(tmp_path / "data")
     spoil(file, "white/left.tif", lambda image: np.roll(image, 6, axis=1))
-    with pytest.raises(lfpiv.InputError, match=r"plane_01\.tif.*'left'.*light falls between the microimages"):
+    with pytest.raises(lfpiv.InputError, match=r"plane_00\.tif.*'left'.*light falls between the microimages"):
         calibrate_first(file)
 
 
