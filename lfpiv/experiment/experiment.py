@@ -159,6 +159,8 @@ class Experiment(Shown):
 
         Parameters
         ----------
+        frame : Frame
+            Frame of the recording.
         grid : Grid, optional
             Grid of the flags, each of which is that of the nearest voxel; default: the voxels of the experiment.
 

@@ -307,8 +307,8 @@ SENTENCES: Mapping[Code, str] = {
         "the order of its images"
     ),
     Code.STILL: (
-        "particles move by at most {voxel:.2g} voxel, which is hardly told from rest: both frames show the same "
-        "exposure, or the time between them is too short for this flow. Compare both frames"
+        "particles move by at most {voxel:.2g} voxel, which is hardly told from rest: unless the fluid rests, both "
+        "frames show the same exposure, or the time between them is too short. Compare both frames"
     ),
     Code.OTHER_SCALE: (
         "the counts relative to {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, exposure, "

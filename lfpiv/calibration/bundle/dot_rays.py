@@ -20,7 +20,7 @@ LEAST_DOTS = 24
 LEAST_LABELS = 10
 """Least number of labels of a dot."""
 WAVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2)])
-"""Periods over a cell of the lattice of microlenses, along both lattice vectors, of the errors of labels."""
+"""Waves of the errors of labels: numbers of periods along both vectors of the lattice of microlenses."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +78,9 @@ class DotRays:
     def lens_terms(self) -> np.ndarray:
         """Return the columns of errors of labels that are periodic over the array, shape (3d, 2 WAVES).
 
-        A model dot of the wrong size or blur is fitted in the wrong place where the edge of a lens cuts its light.
+        A model dot of the wrong size or blur is fitted in the wrong place where the edge of a lens cuts its light. At
+        the lattice coordinates g of a ray the columns are cos(2 pi k.g) and sin(2 pi k.g) for the waves k. Rows are
+        chief rays and slopes along u and v, as a quadratic fit over the pupil finds them.
         """
         origin, steps = np.asarray(self.lattice.origin_mm), np.linalg.inv(np.asarray(self.lattice.basis_mm)) @ WAVES.T
         pupil = spread_over_pupil(1.0)
