@@ -32,6 +32,10 @@ OTHER_APERTURE = 0.2
 """The same difference, above which the stated optics are certainly wrong."""
 UNEVEN = 4.0
 """Ratio of the light in a part of the sensor between two frames of a pair above which a warning is due."""
+HELD = 0.6
+"""Least share of a bright pixel's light that a frame which holds both exposures keeps, relative to the pulses."""
+ALIKE = 0.3
+"""Largest share that is kept the other way round, relative to it: particles that hardly move are kept either way."""
 
 _BAND_ROWS = 512  # rows evaluated, in the middle of the sensor
 _MEAN_REACH_PITCHES = 3.0  # half width of the local mean that is subtracted: ambient light, reflections
@@ -49,6 +53,11 @@ _LEAST_BLUR_PX, _LARGEST_BLUR_PX, _BLURS = 0.3, 1.5, 10  # standard deviations o
 _MODEL_ERROR = 0.01  # of the profile of a blurred disc, relative to its core, root mean square
 _CLEAR_PX, _CLEAR_WITHOUT_DARK_PX = 0.5, 2.0  # width of the gap beyond a microimage's edge
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
+_BRIGHT_SAMPLES, _BRIGHT = (
+    1_000_000,
+    0.995,
+)  # pixels that are compared, and the part of them that is dimmer than the rest
+_DIMMEST, _DIMMER = 0.01, 0.5  # part of bright pixels that may lose light, and level of pixels of the weaker pulse
 _LIT_SHARE = 0.04  # least share of all light in a ninth of the sensor
 _FIELDS = 4  # side of the square of fields into which a ninth is divided
 _LOST_FIELDS = 3.0  # fields that lose their light, beyond their neighbours too: more than a particle that leaves
@@ -255,6 +264,48 @@ def uneven_warnings(first: np.ndarray, second: np.ndarray, camera: str) -> list[
     parts = dark_blocks(first, second)
     figures = {"parts": parts, "ratio": UNEVEN}
     return [Warning(code=Code.UNEVEN, subject=camera, figures=figures)] if parts else []
+
+
+def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> list[Warning]:
+    """Warn of cameras one of whose frames holds the light of both.
+
+    It is nowhere darker than the other one, which has no light where the second pulse's particles are. In a sound pair
+    either frame keeps as much of the other. Pulses differ in energy, alike for all cameras: the least change of light
+    tells their ratio, since an exposure of both pulses adds light.
+
+    Parameters
+    ----------
+    first, second : mapping of str to ndarray, shape (rows, columns)
+        Images of both frames, camera -> image without its dark level [counts].
+    """
+    told = []
+    for held, holding, order in ((first, second, ("first", "second")), (second, first, ("second", "first"))):
+        kept = {name: _kept(held[name], holding[name], 1.0) for name in first}
+        for name, (share, power) in kept.items():
+            others = sorted([other for _, other in kept.values() if 2 * other > power] or [power])
+            pulses = others[(len(others) - 1) // 2]
+            back, _ = _kept(holding[name], held[name], _DIMMER)
+            if share > HELD * pulses and back * pulses < ALIKE * share / pulses:
+                told.append((share / pulses, order, name))
+    clearest = max(told, default=(0.0, ("", ""), ""))[1]  # beside a camera whose light grew, others seem to lose light
+    return [
+        Warning(code=Code.DOUBLE, subject=name, figures={"held": order[0], "holding": order[1]})
+        for _, order, name in told
+        if order == clearest
+    ]
+
+
+def _kept(image: np.ndarray, other: np.ndarray, level: float) -> tuple[float, float]:
+    """Return the least share of its light that a bright pixel keeps in another frame, and the ratio of bright light.
+
+    Pixels count from `level` times the brightness of the brightest ones on.
+    """
+    one, two = (frame.ravel()[:: 1 + frame.size // _BRIGHT_SAMPLES] for frame in (image, other))
+    least_one, least_two = (max(level * float(np.quantile(values, _BRIGHT)), 1e-9) for values in (one, two))
+    bright, others = one >= least_one, two >= least_two
+    if not (bright.any() and others.any()):
+        return 0.0, 0.0
+    return float(np.quantile(two[bright] / one[bright], _DIMMEST)), float(two[others].mean() / one[bright].mean())
 
 
 def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[Warning]:

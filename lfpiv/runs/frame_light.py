@@ -135,7 +135,8 @@ def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: 
         if camera.standing is not None
         for warning in remains_warnings(camera.standing, first.images[name], second.images[name], name)
     ]
-    return (*uneven, *remains)
+    double = [] if uneven else image_checks.double_warnings(first.images, second.images)
+    return (*uneven, *double, *remains)
 
 
 def pair_light(

@@ -16,6 +16,7 @@ class Code(enum.Enum):
     SATURATED = "saturated"
     TONE_CURVE = "tone_curve"
     UNEVEN = "uneven"
+    DOUBLE = "double"
     STANDING = "standing"
     COPIED = "copied"
     DARK_PART = "dark_part"
@@ -113,6 +114,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.UNEVEN: (
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
         "check the laser's pulses and the shutter"
+    ),
+    Code.DOUBLE: (
+        "the {holding} frame shows the light of the {held} one at the same pixels, beside its own: both pulses of the "
+        "laser are in one exposure, which draws displacements towards zero. Check the exposures of this camera against "
+        "the pulses"
     ),
     Code.STANDING: "light stands still at {place}; it is {share:percent} % of an image's light: {remedy}",
     Code.COPIED: (

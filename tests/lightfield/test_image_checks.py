@@ -24,6 +24,7 @@ CLEAR = GAP_LIGHT / 5  # gap light of a camera's own images; real images gave 0.
 GOOD = 0.02  # [pitch] below every limit that warns
 MAGNIFICATION = 0.002  # ten times the spread over rigs and seeds
 QUARTER_PITCH_PX = 3  # of 12.5
+MOVED_PX = (25, 50)  # whole microlenses, beyond the image of a particle
 MIRRORED_PITCH = {"square": 0.4, "hexagonal": np.hypot(0.5, 0.6 - np.sqrt(0.75))}
 """Distance between the lattice of the second of `OFFSETS_MM` and its picture upside down [pitch]."""
 SHIFT_PX = 0.3  # four times the step at which shifts are read
@@ -171,6 +172,26 @@ def test_suspicious_images_are_found(pair_of_cameras):
     image_checks.require_different(images)
     with pytest.raises(lfpiv.InputError, match=r"a copy: .* found the same image as one\. Check particles\.images"):
         image_checks.require_different([*images, ("a copy", image_checks.fingerprint(first.copy()))])
+
+
+@pytest.mark.parametrize("energy", [0.8, 1.0, 1.25])
+def test_a_frame_of_one_camera_with_both_exposures_is_told_whatever_the_pulses_have(pair_of_cameras, energy):
+    experiment, calibration = pair_of_cameras
+    light = {name: experiment.particle_image(name, 0, "a") for name in calibration.cameras}
+    first = {name: image - np.median(image) for name, image in light.items()}
+    second = {name: energy * np.roll(image, MOVED_PX, (0, 1)) for name, image in first.items()}
+    slow = {name: energy * (image + np.roll(image, 1, 0)) / 2 for name, image in first.items()}
+
+    def told(one, other):
+        found = image_checks.double_warnings(one, other)
+        return [(item.subject, item.figures["holding"]) for item in found]
+
+    doubled = {name: 2 * image for name, image in second.items()}
+    assert told(first, second) == told(first, slow) == told(first, doubled) == []
+    both = {name: first[name] + second[name] for name in first}
+    for name in first:
+        assert told(first, {**second, name: both[name]}) == [(name, "second")]
+        assert told({**first, name: both[name]}, second) == [(name, "first")]
 
 
 @pytest.mark.parametrize(
