@@ -138,6 +138,14 @@ def small_run(tmp_path_factory, device):
 
 
 @pytest.fixture
+def brief_run(monkeypatch):
+    """Leave out of runs what `leave_out` does."""
+    from support.small_run import leave_out
+
+    leave_out(monkeypatch.setattr)
+
+
+@pytest.fixture
 def empty_report(monkeypatch):
     """Write an empty page in place of the report of a run."""
     from support.small_run import write_empty_report

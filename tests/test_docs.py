@@ -21,7 +21,7 @@ import matplotlib
 import pytest
 from pydantic import BaseModel
 from support.public_names import public_modules
-from support.small_run import write_empty_report
+from support.small_run import leave_out
 
 import lfpiv
 from lfpiv.cli import commands
@@ -82,7 +82,7 @@ def place(small_run, tmp_path_factory):
     text = experiment.read_text("utf-8")
     experiment.write_text(text.replace("[12, 12, 12]", "[6, 8, 8]"), "utf-8")  # gradients need three vectors along z
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lfpiv.report.page.write_report", write_empty_report)
+        leave_out(patch.setattr)
         pipeline.correlate(experiment, folder / "lfpiv-demo")
     shutil.copytree(folder / "lfpiv-demo", folder / "results", ignore=shutil.ignore_patterns("experiment"))
     shutil.copytree(experiment.parent, folder, dirs_exist_ok=True)
@@ -90,7 +90,7 @@ def place(small_run, tmp_path_factory):
 
 
 @pytest.fixture
-def reader(place, empty_report, monkeypatch):
+def reader(place, brief_run, monkeypatch):
     """A process in that folder; what a snippet does to plots and logging is undone."""
     monkeypatch.chdir(place)
     backend, handlers, level = matplotlib.get_backend(), logging.root.handlers[:], logging.root.level

@@ -447,7 +447,7 @@ def test_wrong_arguments_are_named(rig, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.sample_data
-def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device, empty_report):
+def test_the_sample_experiment_reaches_the_projects_figures(sample_data, tmp_path, device, brief_run):
     """Compare labels and mapping of the sample data with the true rays, and the vectors with the true flow."""
     import xarray as xr
 

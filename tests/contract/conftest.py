@@ -39,10 +39,9 @@ def computed(tmp_path_factory):
     """Arrays of all cases of `bits.py` by one and by two threads, and by loops for a GPU."""
     folder = tmp_path_factory.mktemp("bits")
     ways = {"one thread": (1, "cpu"), "two threads": (2, "cpu"), "loops for a GPU": (1, "gpu")}
-    started = {name: start(BITS, folder / f"{name}.npz", cores, loops=own) for name, (cores, own) in ways.items()}
     found = {}
-    for name, process in started.items():
-        finished = finish(process)
+    for name, (cores, own) in ways.items():  # one after the other: side by side each compiles the same kernels
+        finished = finish(start(BITS, folder / f"{name}.npz", cores, loops=own))
         assert finished.status == 0, finished.errors
         with np.load(folder / f"{name}.npz") as arrays:
             found[name] = {}

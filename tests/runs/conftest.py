@@ -1,10 +1,10 @@
-"""Runs without their report, which takes as long as a small run, where a test is not about it."""
+"""Runs without their report and without the comparison of cameras, which take longer than a small run's pairs."""
 
 import pytest
 
 
 @pytest.fixture(autouse=True)
-def brief_report(request):
-    """Write an empty page in place of the report, unless the test has the marker `whole_report`."""
-    if "whole_report" not in request.keywords:
-        request.getfixturevalue("empty_report")
+def brief_runs(request):
+    """Keep runs brief, unless the test has the marker `whole_run`."""
+    if "whole_run" not in request.keywords:
+        request.getfixturevalue("brief_run")

@@ -49,7 +49,7 @@ def edited(experiment, old, new):
     return experiment
 
 
-@pytest.mark.whole_report
+@pytest.mark.whole_run
 @pytest.mark.slow
 def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path, monkeypatch):
     experiment, _ = lit(small_run, tmp_path / "data")

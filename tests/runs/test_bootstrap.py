@@ -22,7 +22,7 @@ def simulated(small_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bootstrap")
     experiment, out = small_run.images(folder / "data"), small_run.results(folder / "out")
     with experiment.open("a") as file:
-        file.write("\n[bootstrap]\npairs = 3\n")
+        file.write("\n[bootstrap]\npairs = 2\n")
     return experiment, out, pipeline.run(experiment, out)
 
 
@@ -40,7 +40,7 @@ def test_a_short_run_measures_nothing(small_run):
 def test_finished_pairs_get_the_damping_from_one_file(small_run, simulated):
     _, out, summary = simulated
     damping, _ = stored_damping.read(Folder(out).bootstrap)
-    assert summary["damping"] == damping.to_json() and summary["damping"]["simulated"] == 3
+    assert summary["damping"] == damping.to_json() and summary["damping"]["simulated"] == 2
     assert summary["timings_s"]["bootstrap"] == damping.seconds > 0
     assert "Damping by ghosts" in Folder(out).report.read_text("utf-8")
     for pair in range(4):  # files of pairs stay as they were
@@ -73,7 +73,7 @@ def test_it_is_measured_once_and_again_if_lost_or_damaged(simulated, caplog):
 def test_simulated_images_get_the_limit_of_the_counts_of_recorded_ones(small_run, tmp_path, monkeypatch):
     experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
     with experiment.open("a") as file:
-        file.write("\n[bootstrap]\npairs = 3\n")
+        file.write("\n[bootstrap]\npairs = 2\n")
     seen = []
 
     def refuse(weights, vectors, images, measure, **options):
@@ -123,6 +123,6 @@ def test_exported_stores_have_it_and_are_made_anew_when_it_comes(small_run, tmp_
 @pytest.mark.slow
 def test_switching_it_off_removes_it(simulated):
     experiment, out, _ = simulated
-    experiment.write_text(experiment.read_text().replace("pairs = 3\n", "pairs = 0\n"))
+    experiment.write_text(experiment.read_text().replace("pairs = 2\n", "pairs = 0\n"))
     summary = pipeline.run(experiment, out)
     assert summary["damping"] is None and not Folder(out).bootstrap.exists()

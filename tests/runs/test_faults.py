@@ -14,7 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from support.small_run import PAIRS, damage, same_vectors, start
+from support.small_run import BRIEF, PAIRS, damage, same_vectors, start
 
 from lfpiv import open_results
 from lfpiv.cli import commands
@@ -199,7 +199,7 @@ def test_a_full_disk_leaves_nothing_half_written(small_run, tmp_path):
     """The second pair's vectors do not fit: one clear message, status 1, every file whole."""
     out = small_run.prepared(tmp_path / "out")
     room = (small_run.out / "vectors" / "pair_0000.nc").stat().st_size
-    command = [sys.executable, "-m", "lfpiv", "run", str(small_run.experiment), "--out", str(out)]
+    command = [sys.executable, "-c", BRIEF, "run", str(small_run.experiment), "--out", str(out)]
     (out / "vectors").mkdir()
     if mounts():  # the listing shows what is on the small disk, which ends with the namespace
         mount = f"mount -t tmpfs -o size={3 * room // 2} tmpfs {out}/vectors"

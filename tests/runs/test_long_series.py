@@ -138,7 +138,7 @@ def test_a_long_experiment_starts_with_its_first_pairs(tiny_experiment, tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.whole_report
+@pytest.mark.whole_run
 def test_a_summary_of_many_pairs_lists_some_and_names_the_file_of_all(small_run, tmp_path, monkeypatch):
     out = small_run.results(tmp_path / "out")
     monkeypatch.setattr(summary, "MOST_LISTED", 2)

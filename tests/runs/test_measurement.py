@@ -54,6 +54,7 @@ def test_each_pair_and_its_volumes_are_those_of_the_run(small_run, rig):
         assert_same(volume.to_dataset(name="intensity"), xr.load_dataset(path, engine="h5netcdf"))
 
 
+@pytest.mark.slow
 def test_the_long_form_gives_the_same(rig):
     light, grid = rig.light(1), rig.experiment.grid
     images, floor = [one.images for one in light], [one.noise for one in light]

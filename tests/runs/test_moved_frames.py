@@ -12,6 +12,7 @@ LENS_TOLERANCE = 0.25
 """Peaks of one part of a small volume are off by a tenth or two of a voxel, which is a tenth or two of a microlens."""
 
 
+@pytest.mark.whole_run
 @pytest.mark.slow(but="1")
 @pytest.mark.parametrize("lenses", [0, 1])
 def test_second_frames_shifted_by_whole_microlenses_are_told_with_their_number(small_run, tmp_path, lenses):

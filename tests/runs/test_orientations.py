@@ -25,7 +25,7 @@ FROM_ABOVE = {
 
 
 @pytest.mark.slow
-@pytest.mark.whole_report
+@pytest.mark.whole_run
 def test_a_camera_from_above_with_another_lens_and_a_hexagonal_array_needs_no_trick(tmp_path, device, whole_count):
     above = scenes.camera("above", None, (360, 340), **FROM_ABOVE)
     del above["nominal_angle_deg"]

@@ -6,6 +6,8 @@ import lfpiv
 from lfpiv.runs import belonging
 
 
+@pytest.mark.whole_run
+@pytest.mark.slow(but="one missing")
 @pytest.mark.parametrize(
     ("image_of", "told"),
     [

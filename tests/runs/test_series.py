@@ -136,9 +136,10 @@ def test_several_workers_reconstruct_each_instant_once_with_equal_numbers(
     assert same_vectors(reference, tmp_path / "out") == instants - step
 
 
-def test_vectors_are_those_of_the_same_images_as_pairs(small_run, reference):
-    experiment = read_experiment(small_run.experiment)
-    alone = dataclasses.replace(experiment, smart=experiment.smart.model_copy(update={"estimate": "correlation"}))
+@pytest.mark.slow
+def test_vectors_are_those_of_the_same_images_as_pairs(small_run, made, reference):
+    smart = made[1].experiment.smart.model_copy(update={"estimate": "correlation"})
+    alone = dataclasses.replace(read_experiment(small_run.experiment), smart=smart)
     rig = lfpiv.prepare(alone, lfpiv.load_calibration(small_run.out / "calibration.h5"))
     for pair in range(INSTANTS // 2):
         one = lfpiv.measure_pair(rig, pair)
@@ -193,6 +194,7 @@ def test_a_stopped_series_goes_on_at_any_instant(made, reference, tmp_path, solv
     assert same_vectors(reference, tmp_path / "out") == INSTANTS - 1
 
 
+@pytest.mark.slow(but="None")
 @pytest.mark.parametrize("workers", [None, 2])
 def test_a_bad_image_fails_its_two_pairs_and_is_read_once(small_run, made, tmp_path, solved, workers):
     file = write_series(small_run, tmp_path / "data")
@@ -211,6 +213,7 @@ def test_a_bad_image_fails_its_two_pairs_and_is_read_once(small_run, made, tmp_p
         assert solved["images"] == 2 * INSTANTS - 1, "the first camera's image ends the reading of its instant"
 
 
+@pytest.mark.slow
 def test_an_instant_has_one_volume_which_both_its_pairs_use(made, reference, tmp_path, solved):
     work = changed(made[1], tmp_path, keep_volumes=True)
     only = dataclasses.replace(work, vectors=False)

@@ -25,6 +25,7 @@ def write_series(small_run, folder: Path) -> Path:
     """Write the images of the small run's pairs one after the other as instants; return the experiment file.
 
     Instants 3 and 4 are the frames of pair 0, 5 and 6 those of pair 1. Between pairs the particles are others.
+    Voxels are no finer than those of the vectors, and iterations are few: half of the time.
     """
     file = small_run.images(folder)
     pairs = read_experiment(file)
@@ -34,7 +35,7 @@ def write_series(small_run, folder: Path) -> Path:
                 path = folder / f"run/{camera.name}/{FIRST + 2 * pair + number:05d}.tif"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 pairs.particle_path(camera.name, pair, frame).rename(path)
-    text = file.read_text()
+    text = file.read_text().replace("iterations = 8", "iterations = 3\nrefinement = 1.0")
     head, particles = text.split("[particles]\n")
     rest = particles.split("\n\n", 1)[1]
     keys = f'images = "run/{{camera}}/{{instant:05d}}.tif"\ninstants = {2 * pairs.pairs}\nfirst = {FIRST}\n\n'

@@ -12,6 +12,7 @@ import xarray as xr
 from support import scenes
 
 from lfpiv.runs import pipeline
+from lfpiv.runs.belonging import Agreement
 from lfpiv.simulation.simulator import simulate
 
 PAIRS = 4
@@ -87,13 +88,16 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
 BRIEF = """
 import lfpiv.report.page
 from lfpiv.cli import commands
+from lfpiv.runs import belonging, odd_pairs
 from lfpiv.weights import counting
 
 lfpiv.report.page.write_report = lambda *given: given[-1].write_text("", "utf-8")
+belonging.check = lambda *given: belonging.Agreement(sentence="not compared")
+odd_pairs.settle = lambda *given: []
 counting.VOXELS = 2
 commands.main()
 """
-"""The command line with an empty report and two counted voxels, as in tests that run in this process."""
+"""The command line with brief runs and two counted voxels, as in tests that run in this process."""
 
 
 def start(*arguments, **options) -> subprocess.Popen:
@@ -109,6 +113,13 @@ def start(*arguments, **options) -> subprocess.Popen:
 def write_empty_report(*given) -> None:
     """Write an empty page in place of `lfpiv.write_report`, which takes as long as a small run."""
     given[-1].write_text("", "utf-8")
+
+
+def leave_out(change) -> None:
+    """Write an empty report, compare no cameras and judge no odd pairs; `change` sets an attribute by its name."""
+    change("lfpiv.report.page.write_report", write_empty_report)
+    change("lfpiv.runs.belonging.check", lambda *given: Agreement(sentence="not compared"))
+    change("lfpiv.runs.odd_pairs.settle", lambda *given: [])
 
 
 def damage(path: Path) -> None:

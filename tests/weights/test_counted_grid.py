@@ -213,7 +213,7 @@ def test_the_setting_offers_what_the_kernel_can():
 
 
 @pytest.mark.slow
-def test_a_run_with_counted_weights_measures_the_same_vectors(small_run, tmp_path, device, empty_report):
+def test_a_run_with_counted_weights_measures_the_same_vectors(small_run, tmp_path, device, brief_run):
     experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
     text = experiment.read_text().replace("[smart]\n", "[smart]\nrefinement = 1.0\n")  # a count of few voxels
     experiment.write_text(text + '\n[compute]\nweights = "count"\n')
