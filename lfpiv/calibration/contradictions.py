@@ -43,6 +43,12 @@ NEARER_DEG = 10.0
 OTHER_ARRAY = 0.5
 """Light between the microimages of another camera's white image, relative to the own white image, below which board
 images belong to the other camera."""
+BAND_ROWS = 512
+"""Rows of board images that are compared, in the middle of the sensor."""
+NOISE = 0.2
+"""Correlation of diagonal neighbours in what two images of the board differ by, below which it is noise."""
+SEEN = 0.5
+"""Least correlation of such images, so that they show more than noise."""
 
 Decoders = Callable[[CameraSetup], LightFieldDecoder]
 Dots = Callable[[CameraSetup, LightFieldDecoder, Mistake], BoardDots | None]
@@ -56,11 +62,19 @@ def check_place(
     images: Sequence[np.ndarray],
     others: Callable[[], Mapping[str, LightFieldDecoder]],
 ) -> None:
-    """Refuse board images whose light does not lie in the microimages of the white image.
+    """Refuse board images whose light does not lie in the microimages of the white image, or of planes at one place.
 
     `others` returns the decoders of the other cameras, of which an image that does not fit may be.
     """
     dark, paths = experiment.dark(setup.name), [experiment.board_path(setup.name, n) for n in range(len(images))]
+    planes_mm = experiment.board.planes_mm
+    for one, other in combinations(range(len(images)), 2):
+        if planes_mm[one] != planes_mm[other] and _differ_by_noise(images[one], images[other]):
+            raise InputError(
+                f"{paths[other]}: board.images of camera {setup.name!r}: plane {other} shows, but for noise, what "
+                f"plane {one} shows, while board.planes_mm has them at {planes_mm[one]:g} and {planes_mm[other]:g} mm. "
+                "Give each plane its own image, and look whether the stage moved."
+            )
     between, wrong, found = np.zeros(len(images)), [], ""
     for plane, image in enumerate(images):
         light = image if dark is None else image - dark
@@ -78,6 +92,21 @@ def check_place(
         raise InputError(f"{paths[wrong[0]]}: board.images of camera {setup.name!r}: {found}")
     if between[worst] > GAP_LIGHT:
         warn(log, Warning(code=Code.BOARD_MISPLACED, subject=setup.name, figures={"path": str(paths[worst])}))
+
+
+def _differ_by_noise(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two images of the board differ by noise and brightness alone.
+
+    Noise is independent from pixel to pixel. Dots that stand or come into focus elsewhere change whole microimages.
+    """
+    start = max((len(first) - BAND_ROWS) // 2, 0)
+    one, other = (image[start : start + BAND_ROWS].astype(float) for image in (first, second))
+    one, other = one - one.mean(), other - other.mean()
+    both = float((one * other).sum())
+    left = other - one * (both / max(float((one**2).sum()), 1e-30))
+    near = float((left[1:, 1:] * left[:-1, :-1]).sum())
+    seen = both > SEEN * float(np.linalg.norm(one) * np.linalg.norm(other))
+    return seen and near <= NOISE * float((left**2).sum())
 
 
 def _found(shift: Mapping[str, Any] | None, misplaced: bool) -> str:

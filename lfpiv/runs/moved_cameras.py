@@ -20,6 +20,7 @@ from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import read_darks, without_background
 from lfpiv.runs.moved_frames import FRAMES, moved_frames
+from lfpiv.runs.shifted_images import shifted_images
 from lfpiv.selfcalibration.disparity import CameraVolumes, still_light, unlinked, without_still_light
 from lfpiv.selfcalibration.movements import AGREEING, Verdict, fit_movements, self_calibrate
 from lfpiv.warn import Code, Warning, warn
@@ -178,11 +179,14 @@ def check(shown: ShownParticles, weights: Weights, *, in_time: bool) -> CameraDi
         return nothing if nothing == used else []
     separation = fit.separation
     disparity, std = (length / experiment.grid.voxel_mm for length in (separation.mm, separation.std_mm))
-    jolt = None if experiment.recording.is_series else moved_frames(volumes, weights.cameras, in_order=in_time)
+    series = experiment.recording.is_series
+    jolt = None if series else moved_frames(volumes, weights.cameras, in_order=in_time)
     if jolt is not None:
         warn(log, jolt)
     elif disparity > LARGE_VOXEL and separation.significant and (len(used) == 1 or _agree(volumes, used, fit)):
         warn(log, _apart(disparity, experiment, weights.cameras, in_time=in_time))
+    elif (shifted := shifted_images(shown, shown.pairs, weights, series=series)) is not None:
+        warn(log, shifted)
     return CameraDisparity(voxel=round(disparity, 3), std_voxel=round(std, 3), pairs=tuple(used))
 
 

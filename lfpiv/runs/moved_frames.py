@@ -2,7 +2,7 @@
 
 Particles move alike in all cameras, and a camera that moved before the recording shows both frames at the same wrong
 place. So the first frames are the measure: what is left is a camera that moved between its exposures, or images that
-were shifted. Two cameras do not show a shift in the plane of their lines of sight, which is another depth to them.
+were shifted. A shift in the plane of the lines of sight is another depth to all cameras (`shifted_images` finds it).
 """
 
 from __future__ import annotations

@@ -102,10 +102,10 @@ def advantage(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
 
     Under chance the differences of all parts have either sign. Frames that only one set has do not count.
     """
-    return _in_errors([b - a for a, b in zip(one, other, strict=False)])
+    return in_errors([b - a for a, b in zip(one, other, strict=False)])
 
 
-def _in_errors(differences: Sequence[np.ndarray]) -> float:
+def in_errors(differences: Sequence[np.ndarray]) -> float:
     """Return the sum of differences over its standard error under chance."""
     difference = np.concatenate(differences)
     scatter = float(np.sqrt(difference @ difference))
@@ -179,7 +179,7 @@ class Judgement:
         Each frame beats chance, too. The order of frames does not count, since particles that hardly move fit in either
         order.
         """
-        if min((_in_errors([frame]) for frames in self._over_chance for frame in frames), default=SURE) < SURE:
+        if min((in_errors([frame]) for frames in self._over_chance for frame in frames), default=SURE) < SURE:
             return False
         wrong = [one for one in self.tried if one.kind not in IN_TIME]
         return not self.mistakes and self.over_chance > CLEAR and all(self.margin(one) > SURE for one in wrong)
@@ -203,7 +203,7 @@ class Judgement:
     @property
     def over_chance(self) -> float:
         """Return the least advantage of the images as they are over those of other particles [standard errors]."""
-        return min((_in_errors(frames) for frames in self._over_chance), default=0.0)
+        return min((in_errors(frames) for frames in self._over_chance), default=0.0)
 
     @property
     def _partners(self) -> list[Mistake]:

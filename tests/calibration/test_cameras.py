@@ -396,6 +396,15 @@ def test_the_image_of_a_plane_that_lies_beside_the_white_image_is_named(rig, tmp
         lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {1: beside}))
 
 
+@pytest.mark.parametrize("noise", [0, 20])
+def test_a_plane_that_shows_the_image_of_another_is_named(rig, tmp_path, noise):
+    experiment, _, _ = rig
+    image = experiment.board_image("only", 1)
+    again = np.rint(1.1 * image + noise * np.random.default_rng(1).random(image.shape)).astype(np.uint16)
+    with pytest.raises(lfpiv.InputError, match=r"plane_03\.tif.*plane 3 shows, but for noise, what plane 1 shows"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {3: again}))
+
+
 def test_particle_images_in_place_of_boards_are_refused(rig, tmp_path):
     experiment, _, _ = rig
     frames = [experiment.particle_image("only", 0, frame).astype(np.uint16) for frame in "ab"]

@@ -1,4 +1,4 @@
-"""One camera's second frames shifted by a whole microlens, which its own white image does not show."""
+"""One camera's frames shifted by a whole microlens, which its own white image does not show."""
 
 import numpy as np
 import pytest
@@ -13,19 +13,30 @@ LENS_TOLERANCE = 0.25
 
 
 @pytest.mark.whole_run
-@pytest.mark.slow(but="1")
-@pytest.mark.parametrize("lenses", [0, 1])
-def test_second_frames_shifted_by_whole_microlenses_are_told_with_their_number(small_run, tmp_path, lenses):
+@pytest.mark.slow(but="1-columns")
+@pytest.mark.parametrize(
+    ("lenses", "axis", "every", "code", "names"),
+    [
+        pytest.param(0, 0, 2, None, "", id="0"),
+        pytest.param(1, 0, 2, Code.MOVED_FRAMES, "left or right", id="1-rows"),
+        pytest.param(1, 1, 2, Code.MOVED_FRAMES, "left", id="1-columns"),
+        pytest.param(1, 1, 1, Code.APART, "", id="all-columns"),
+    ],
+)
+def test_frames_shifted_by_whole_microlenses_are_told_with_their_number(
+    small_run, tmp_path, lenses, axis, every, code, names
+):
+    """Along the columns the shift lies in the plane of both lines of sight, and is another depth to both cameras."""
     file = small_run.images(tmp_path / "data")
     experiment = lfpiv.open_experiment(file)
     camera = lfpiv.load_calibration(small_run.out / "calibration.h5").cameras["left"]
-    rows = round(lenses * camera.optics.microimage_pitch_px)
-    for path in sorted((file.parent / "particles" / "left").iterdir())[1::2]:
-        tifffile.imwrite(path, np.roll(tifffile.imread(path), rows, axis=0))
+    pixels = round(lenses * camera.optics.microimage_pitch_px)
+    for path in sorted((file.parent / "particles" / "left").iterdir())[every - 1 :: every]:
+        tifffile.imwrite(path, np.roll(tifffile.imread(path), pixels, axis=axis))
     weights = lfpiv.build_weights(lfpiv.load_calibration(small_run.out / "calibration.h5"), experiment.grid)
     with collected(quiet=True) as found:
         agreement = belonging.check(experiment, weights, [0])
     assert not agreement.refusals
-    told = [one for one in found if one.code is Code.MOVED_FRAMES]
-    assert [one.subject for one in told] == ["left or right"] * lenses and len(found) == len(told)
-    assert all(abs(one.figures["lenses"] - lenses) < LENS_TOLERANCE for one in told)
+    assert [(one.code, one.subject) for one in found] == [(code, names)] * lenses
+    if code is Code.MOVED_FRAMES:
+        assert abs(found[0].figures["lenses"] - lenses) < LENS_TOLERANCE
