@@ -25,7 +25,7 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.camera import CalibratedCamera, Calibration
 from lfpiv.calibration.checks import NominalDifference
-from lfpiv.calibration.committee import SPLITS, Rays, distance_of_halves, smooth_departure, train_several
+from lfpiv.calibration.committee import Rays, distance_of_halves, smooth_departure, train_several
 from lfpiv.calibration.liquid import median_distance
 from lfpiv.calibration.measured_camera import (
     KeptCameras,
@@ -291,11 +291,11 @@ def _fit_mapping(
     region_mm, radius = np.stack([points.min(0), points.max(0)]), setup.optics.pupil_radius_mm
     with input_errors(place):
         chosen = train_several(trained, region_mm, radius, seed=settings.seed, unit=pitch_mm)
-        splits = SPLITS if chosen.scatters() else 1
-        halves = distance_of_halves(of_part, dots.dot[agreeing], region_mm, radius, settings.seed, splits) / pitch_mm
-    training, inputs = chosen.training, np.hstack([points, pupil])
+        training, inputs = chosen.training, np.hstack([points, pupil])
+        held_out_mm, number = training.sigma_nor * pitch_mm, dots.dot[agreeing]
+        halves = distance_of_halves(of_part, number, region_mm, radius, settings.seed, held_out_mm) / pitch_mm
     chance = max(chosen.error, training.sigma_nor if math.isnan(halves) else halves)
-    unfollowed = smooth_departure(inputs, target - training.network(inputs), dots.dot[agreeing]) / pitch_mm
+    unfollowed = smooth_departure(inputs, target - training.network(inputs), number) / pitch_mm
     held_out = training.split.test
     held = stated_mm[agreeing][held_out], pupil[held_out]
     mapped = training.network(np.hstack(held)) + (0.0 if baseline is None else baseline(*held))

@@ -40,7 +40,8 @@ RAYS = 2000
 FEWEST_DOTS = 40
 """Least number of dots that are halved."""
 SPLITS = 3
-"""Pairs of halves to take where networks scatter: the network of a half may be unlucky."""
+"""Pairs of halves to take where the first pair is further apart than the held-out dots allow: the network of a half may
+be unlucky."""
 CHANCE = 1e-3
 """Probability that labels about a mapping that follows them show a smooth departure by chance."""
 
@@ -59,10 +60,6 @@ class Chosen:
     since both ends of a distance have errors. A few networks that are far off do not change a median."""
     error: float
     """Error of this network by chance: its distance to the median of all, and the standard error of that median."""
-
-    def scatters(self, unit: float = 1.0) -> bool:
-        """Return whether networks scatter by more than the held-out dots show; `unit` is as in `train_several` [mm]."""
-        return self.scatter >= self.training.sigma_nor * unit
 
 
 def train_several(
@@ -88,7 +85,7 @@ def train_several(
     """
     trainings = [train(seed + number) for number in range(NETWORKS)]
     found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
-    while found.scatters(unit) and len(trainings) < MOST_NETWORKS:
+    while found.scatter >= found.training.sigma_nor * unit and len(trainings) < MOST_NETWORKS:
         trainings.append(train(seed + len(trainings)))
         found = nearest_to_others(trainings, region_mm, pupil_radius_mm, seed)
     number = trainings.index(found.training) + 1
@@ -137,7 +134,7 @@ def distance_of_halves(
     region_mm: np.ndarray,
     pupil_radius_mm: float,
     seed: int,
-    splits: int = 1,
+    held_out: float,
 ) -> float:
     """Return the mean error of a mapping that the noise of its labels makes, from mappings of half of the dots each.
 
@@ -152,8 +149,8 @@ def distance_of_halves(
         Number of each label's dot.
     region_mm, pupil_radius_mm, seed
         As `nearest_to_others` takes them.
-    splits : int
-        Pairs of halves, of which the median is taken.
+    held_out : float
+        Error of held-out dots. A first pair of halves with a larger error is one of `SPLITS`, whose median counts.
 
     Returns
     -------
@@ -163,12 +160,12 @@ def distance_of_halves(
     rng, (low, high), dots = np.random.default_rng(seed), region_mm, np.unique(dot)
     if len(dots) < FEWEST_DOTS:
         return np.nan
-    errors = []
-    for _ in range(splits):
+    errors: list[float] = []
+    while not errors or (errors[0] > held_out and len(errors) < SPLITS):
         half = np.isin(dot, rng.permutation(dots)[: len(dots) // 2])
         rays = rng.uniform(low, high, (RAYS, 3)), random_on_pupil(INNER * pupil_radius_mm, RAYS, rng)
         apart = fit(half)(*rays) - fit(~half)(*rays)
-        errors.append(np.linalg.norm(apart, axis=1).mean() / 2)
+        errors.append(float(np.linalg.norm(apart, axis=1).mean() / 2))
     return float(np.median(errors))
 
 

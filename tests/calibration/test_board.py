@@ -18,7 +18,7 @@ from lfpiv.calibration.board.dot_model import (
     bends,
     ray_terms,
 )
-from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_pixels, follow_bend
+from lfpiv.calibration.board.dot_shared import estimate_bend, estimate_diameter, estimate_pixels, follow
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.edges import MARGIN, find_extents, require_stated
 from lfpiv.calibration.board.planes import HELD_BYTES, Planes
@@ -430,10 +430,24 @@ def test_a_bend_is_found_in_all_dots_and_none_is_found_in_noise(count):
     assert (
         np.abs(shared.bend_mm - true).max() < 5 * 2 / np.sqrt(count) * 1.5
     )  # five standard errors, and a half for dots of little information
-    moved = follow_bend([None, *fits], shared.bend_mm - start.bend_mm)
+    moved = follow([None, *fits], start, shared)
     assert moved[0] is None
     change = following[:, 2:] @ (shared.bend_mm - start.bend_mm).T.ravel()
     assert np.allclose(moved[1].coefficients.T.ravel(), change)
+
+
+def test_the_diameter_of_all_dots_is_their_weighted_mean_and_the_fits_follow_it():
+    random = np.random.default_rng(8)
+    start = SharedParameters(diameter_mm=0.1, blur_px=0.3, bend_mm=np.zeros((BENDS, 2)))
+    fits, following = fits_with_bend(start.bend_mm, 20, 0.0, start.bend_mm, random)
+    weight = np.array([fit.pull_information[0, 0] for fit in fits])
+    shown = 0.02 * random.normal(size=len(fits))
+    fits = [replace(fit, pull=np.append(w * d, fit.pull[1:])) for fit, w, d in zip(fits, weight, shown, strict=True)]
+    shared = estimate_diameter(start, [*fits, None])
+    assert np.log(shared.diameter_mm / 0.1) == pytest.approx(np.average(shown, weights=weight), rel=1e-6)
+    assert shared.blur_px == start.blur_px and not shared.bend_mm.any()
+    moved = follow(fits, start, shared)[0].coefficients.T.ravel()
+    assert np.allclose(moved, following[:, 0] * np.log(shared.diameter_mm / 0.1))
 
 
 @pytest.mark.parametrize("spacing_pitches", [3.2, 4.5, 7.0])

@@ -121,14 +121,14 @@ def test_half_the_distance_of_two_halves_is_the_error_that_noise_makes():
             smooth = np.linalg.lstsq(terms(rays[part, :3], 0), (labels - places(rays))[part], rcond=None)[0]
             return lambda points, pupil: terms(points, pupil) @ smooth
 
-        found.append(distance_of_halves(fit, dot, REGION_MM, PUPIL_MM, seed))
+        found.append(distance_of_halves(fit, dot, REGION_MM, PUPIL_MM, seed, np.inf))
     expected = NOISE_MM * np.sqrt(10 / DOTS) * np.sqrt(np.pi / 2)
     assert np.mean(found) == pytest.approx(expected, rel=0.15)  # of twenty draws, each with ten unknowns
-    assert np.isnan(distance_of_halves(fit, dot % 30, REGION_MM, PUPIL_MM, 0))
+    assert np.isnan(distance_of_halves(fit, dot % 30, REGION_MM, PUPIL_MM, 0, np.inf))
 
 
-@pytest.mark.parametrize(("splits", "expected"), [(1, 9.0), (3, 1.0)])
-def test_an_unlucky_network_of_a_half_is_outvoted(splits, expected):
+@pytest.mark.parametrize(("held_out", "expected"), [(10.0, 9.0), (8.0, 1.0)])
+def test_halves_further_apart_than_held_out_dots_allow_are_outvoted(held_out, expected):
     """The first half is displaced by 18, and half of the distance counts."""
     displaced = iter([18.0, 0.0, 2.0, 0.0, 0.0, 2.0])
 
@@ -136,7 +136,7 @@ def test_an_unlucky_network_of_a_half_is_outvoted(splits, expected):
         shift = next(displaced)
         return lambda points, pupil: np.column_stack([np.full(len(points), shift), np.zeros(len(points))])
 
-    assert distance_of_halves(fit, np.arange(100), REGION_MM, PUPIL_MM, 0, splits) == pytest.approx(expected)
+    assert distance_of_halves(fit, np.arange(100), REGION_MM, PUPIL_MM, 0, held_out) == pytest.approx(expected)
 
 
 def test_a_mapping_that_does_not_follow_its_labels_departs_smoothly():

@@ -154,8 +154,9 @@ def _stepped(
     for _ in range(_ROUNDS):
         change = bend - shared.bend_mm
         change *= min(1.0, _LARGEST_CHANGE * pitch / max(_largest(change), 1e-12))
-        shared = replace(shared, bend_mm=shared.bend_mm + change)
-        found = fit_dots(_model(pixels, shared), pixels, sample, margin_mm, follow_bend(found, change))
+        nearer = replace(shared, bend_mm=shared.bend_mm + change)
+        found = fit_dots(_model(pixels, nearer), pixels, sample, margin_mm, follow(found, shared, nearer))
+        shared = nearer
         now = _typical(found)[1]
         if now < (typical if best else limit):
             best = shared, found
@@ -254,11 +255,23 @@ def _common_bend(
     return found.reshape(2, -1).T, chance
 
 
-def follow_bend(fits: Sequence[DotFit | None], change_mm: np.ndarray) -> list[DotFit | None]:
-    """Return the fits with the coefficients that belong to a bend changed by `change_mm`, to first order."""
-    change = change_mm.T.ravel()
+def estimate_diameter(shared: SharedParameters, fits: Sequence[DotFit | None]) -> SharedParameters:
+    """Return the shared parameters with the diameter that all dots show by their `fits`, one step from `shared`.
+
+    Blur and bend stay: where rays are bent more than the bend can say, diameter and blur stand for it together.
+    """
+    sure, _ = _typical(fits)
+    change = sum(fit.pull[0] for fit in sure) / max(sum(fit.pull_information[0, 0] for fit in sure), 1e-12)
+    change = np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE)
+    return replace(shared, diameter_mm=float(shared.diameter_mm * np.exp(change)))
+
+
+def follow(fits: Sequence[DotFit | None], before: SharedParameters, after: SharedParameters) -> list[DotFit | None]:
+    """Return the fits by the shared parameters `before` as they would be by those `after`, to first order."""
+    size = [np.log(after.diameter_mm / before.diameter_mm), after.blur_px**2 - before.blur_px**2]
+    change = np.append(size, (after.bend_mm - before.bend_mm).T.ravel())
     return [
-        fit and replace(fit, coefficients=fit.coefficients + (fit.following[:, 2:] @ change).reshape(2, TERMS).T)
+        fit and replace(fit, coefficients=fit.coefficients + (fit.following @ change).reshape(2, TERMS).T)
         for fit in fits
     ]
 

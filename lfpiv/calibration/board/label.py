@@ -18,9 +18,10 @@ from lfpiv.calibration.board.dot_fit import FEWEST_PIXELS, BoardPixels, DotFit, 
 from lfpiv.calibration.board.dot_model import TERMS, LensIntegral, ray_terms, slope_of
 from lfpiv.calibration.board.dot_shared import (
     estimate_bend,
+    estimate_diameter,
     estimate_pixels,
     estimate_shared,
-    follow_bend,
+    follow,
     labels_spread,
 )
 from lfpiv.calibration.board.dots import FEWEST_DOTS, Detection, DotBoard, Labels, expect_dots
@@ -67,13 +68,15 @@ def label_by_integral(signals: Signals, decoder: LightFieldDecoder, board: DotBo
     fits = fit_dots(LensIntegral(optics, decoder.lattice, shared), pixels, expected, margin)
     bent = estimate_bend(shared, fits, pitch)
     spread_mm = labels_spread(bent, fits, pitch)
-    fits = follow_bend(fits, bent.bend_mm - shared.bend_mm)
+    fits = follow(fits, shared, bent)
 
     pixels = estimate_pixels(pixels, fits)
     prior = _predict(fits, detection, board, optics)
     expected = expect_dots(prior.pose, board, optics, prior.dot, prior.theta, prior.sigma)
     model = LensIntegral(optics, decoder.lattice, bent)
     fits = fit_dots(model, pixels, expected, _MARGIN_PITCHES[1] * pitch)
+    resized = estimate_diameter(bent, fits)
+    fits, model = follow(fits, bent, resized), LensIntegral(optics, decoder.lattice, resized)
     trusted = _trusted(fits, prior, board, pitch, detection.sign)
     rejected = prior.dot[np.isin(prior.dot, detection.dot) & ~trusted]
     measured = {int(dot): fit for dot, fit, sure in zip(prior.dot, fits, trusted, strict=True) if sure and fit}
