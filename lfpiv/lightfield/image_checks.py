@@ -53,11 +53,12 @@ _LEAST_BLUR_PX, _LARGEST_BLUR_PX, _BLURS = 0.3, 1.5, 10  # standard deviations o
 _MODEL_ERROR = 0.01  # of the profile of a blurred disc, relative to its core, root mean square
 _CLEAR_PX, _CLEAR_WITHOUT_DARK_PX = 0.5, 2.0  # width of the gap beyond a microimage's edge
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
-_BRIGHT_SAMPLES, _BRIGHT = (
-    1_000_000,
-    0.995,
-)  # pixels that are compared, and the part of them that is dimmer than the rest
-_DIMMEST, _DIMMER = 0.01, 0.5  # part of bright pixels that may lose light, and level of pixels of the weaker pulse
+_BRIGHT_SAMPLES, _BRIGHT = 1_000_000, 0.995  # pixels that are compared, part of them that is dimmer than the rest
+_DIMMER = 0.5  # level from which pixels of the weaker pulse count, relative to the brightest ones
+_LOST, _LOST_BACK = (
+    0.01,
+    0.03,
+)  # part of bright pixels that may lose light, and of all from `_DIMMER` on
 _LIT_SHARE = 0.04  # least share of all light in a ninth of the sensor
 _FIELDS = 4  # side of the square of fields into which a ninth is divided
 _LOST_FIELDS = 3.0  # fields that lose their light, beyond their neighbours too: more than a particle that leaves
@@ -280,11 +281,11 @@ def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.nda
     """
     told = []
     for held, holding, order in ((first, second, ("first", "second")), (second, first, ("second", "first"))):
-        kept = {name: _kept(held[name], holding[name], 1.0) for name in first}
+        kept = {name: _kept(held[name], holding[name], 1.0, _LOST) for name in first}
         for name, (share, power) in kept.items():
             others = sorted([other for _, other in kept.values() if 2 * other > power] or [power])
             pulses = others[(len(others) - 1) // 2]
-            back, _ = _kept(holding[name], held[name], _DIMMER)
+            back, _ = _kept(holding[name], held[name], _DIMMER, _LOST_BACK)
             if share > HELD * pulses and back * pulses < ALIKE * share / pulses:
                 told.append((share / pulses, order, name))
     clearest = max(told, default=(0.0, ("", ""), ""))[1]  # beside a camera whose light grew, others seem to lose light
@@ -295,17 +296,18 @@ def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.nda
     ]
 
 
-def _kept(image: np.ndarray, other: np.ndarray, level: float) -> tuple[float, float]:
-    """Return the least share of its light that a bright pixel keeps in another frame, and the ratio of bright light.
+def _kept(image: np.ndarray, other: np.ndarray, level: float, lost: float) -> tuple[float, float]:
+    """Return the share of their light that all but a part `lost` of bright pixels keep in another frame.
 
-    Pixels count from `level` times the brightness of the brightest ones on.
+    Pixels count from `level` times the brightness of the brightest ones on. The second value is the ratio of bright
+    light.
     """
     one, two = (frame.ravel()[:: 1 + frame.size // _BRIGHT_SAMPLES] for frame in (image, other))
     least_one, least_two = (max(level * float(np.quantile(values, _BRIGHT)), 1e-9) for values in (one, two))
     bright, others = one >= least_one, two >= least_two
     if not (bright.any() and others.any()):
         return 0.0, 0.0
-    return float(np.quantile(two[bright] / one[bright], _DIMMEST)), float(two[others].mean() / one[bright].mean())
+    return float(np.quantile(two[bright] / one[bright], lost)), float(two[others].mean() / one[bright].mean())
 
 
 def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[Warning]:
