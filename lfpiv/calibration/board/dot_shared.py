@@ -33,7 +33,7 @@ from lfpiv.warn import Code, Warning, warn
 
 log = logging.getLogger(__name__)
 
-_SAMPLE = 48  # dots that estimate diameter, blur and a first bend
+_SAMPLE = 48  # dots that estimate blur, a first diameter and a first bend
 _ROUNDS = 8
 _CHANGE = 0.005  # smallest change that needs another round [logarithm, pixel^2, pitch]
 _LARGEST_CHANGE = 0.25  # of one round, in the same units
