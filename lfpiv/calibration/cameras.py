@@ -168,7 +168,7 @@ def _fit_board(experiment: Experiment, measured: Mapping[str, Measured]) -> Boar
             dots=_without_surface(measured[setup.name]),
             lens=measured[setup.name].lens,
             pupil_radius_mm=setup.optics.pupil_radius_mm,
-            lattice=measured[setup.name].sensor.lattice,
+            pitch_mm=measured[setup.name].sensor.lattice.pitch_mm,
         )
         for setup in experiment.cameras
     ]

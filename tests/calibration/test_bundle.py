@@ -13,12 +13,10 @@ from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.bundle.fit import fit_board
 from lfpiv.calibration.thin_lens_model import fit_thin_lens
 from lfpiv.errors import InputError
-from lfpiv.geometry.optics import LensLattice
 from lfpiv.simulation.scene_camera import Aberrations, SceneCamera, Window, true_mapping
 from lfpiv.warn import Code
 
 BOARD = DotBoard(dots=(6, 6), spacing_mm=0.8, diameter_mm=0.1, planes_mm=(-1.2, -0.7, -0.3, 0.2, 0.6, 1.2))
-LATTICE = LensLattice(origin_mm=(0.02, 0.01), basis_mm=((0.1, 0.0), (0.0, 0.1)))
 NOISE_MM = 2e-4  # error of a dot's chief ray, as the labels of rendered boards have it
 LEFT_MM = {1: 6e-3, 2: 1e-3}  # error of corrected planes by number of cameras; one sees depth by its pupil only
 LEFT_SHARE = 0.5  # of the errors of dots; those that bend lines of dots smoothly look like distortion of the lens
@@ -59,10 +57,10 @@ def true_points(plane_errors, dot_errors, board=BOARD):
     return np.concatenate(points)
 
 
-def labels(angle, optics, points, rng, board=BOARD, wrong=0, along_s=1.0, wave_mm=0.0):
+def labels(angle, optics, points, rng, board=BOARD, wrong=0, along_s=1.0):
     """Labels of all dots at `points`; `wrong` dots carry the label of a place that is 0.8 mm away.
 
-    Their noise is `along_s` times larger along s than along t. They err by `wave_mm` away from the middles of lenses.
+    Their noise is `along_s` times larger along s than along t.
     """
     scene_camera = camera(angle, optics)
     radius, count = scene_camera.optics.pupil_radius_mm, len(points)
@@ -72,7 +70,6 @@ def labels(angle, optics, points, rng, board=BOARD, wrong=0, along_s=1.0, wave_m
     noise = NOISE_MM * np.array([along_s, 1.0]) * rng.standard_normal((count, 3, 2))[dot]
     array = true_mapping(scene_camera)(points[dot], pupil)
     array += noise[:, 0] + noise[:, 1] * pupil[:, :1] / radius + noise[:, 2] * pupil[:, 1:] / radius
-    array += wave_mm * np.sin(2 * np.pi * (array - LATTICE.origin_mm) / LATTICE.pitch_mm)
     array[np.isin(dot, rng.choice(count, wrong, replace=False))] += 0.8
     planes = np.full(len(board.planes_mm), board.size)
     dots = BoardDots(
@@ -83,7 +80,7 @@ def labels(angle, optics, points, rng, board=BOARD, wrong=0, along_s=1.0, wave_m
         shared_error_mm=0.0,
     )  # fmt: skip
     lens = fit_thin_lens(dots.points_mm, pupil, array, scene_camera.optics, std=dots.std_mm)
-    return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=radius, lattice=LATTICE)
+    return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=radius, pitch_mm=0.1)
 
 
 def fitted(points, angles, optics="ideal", seed=0, board=BOARD, **faults):
@@ -118,16 +115,6 @@ def test_a_perfect_board_is_not_corrected(cameras, optics):
 def test_a_perfect_board_is_not_corrected_where_dots_are_seen_worse_along_rows(cameras, seed):
     """Dots of a row a whole number of lenses apart, each within a lens, show little of their place along the row."""
     found = fitted(true_points(*errors_of(np.random.default_rng(0))), ANGLES[cameras], seed=seed, along_s=8.0)
-    assert found.corrected == ()
-
-
-@pytest.mark.parametrize("spacing_mm", [0.47, 0.73])
-@pytest.mark.parametrize("cameras", ANGLES)
-def test_a_perfect_board_is_not_corrected_where_a_wrong_size_of_dots_moves_labels_within_lenses(cameras, spacing_mm):
-    """Rows of dots lie at few places within the lenses, the same ones in all planes and cameras."""
-    board = DotBoard(dots=(6, 5), spacing_mm=spacing_mm, diameter_mm=0.12, planes_mm=(-0.9, -0.3, 0.3, 0.9))
-    none = np.zeros((len(board.planes_mm), 6)), np.zeros((board.size, 2))
-    found = fitted(true_points(*none, board), ANGLES[cameras], board=board, wave_mm=3 * NOISE_MM)
     assert found.corrected == ()
 
 

@@ -10,7 +10,6 @@ from lfpiv import warn
 from lfpiv.calibration.bundle.dot_rays import CameraLabels
 from lfpiv.calibration.scales import check_scales
 from lfpiv.calibration.thin_lens_model import fit_thin_lens, thin_lens_model
-from lfpiv.geometry.optics import LensLattice
 from lfpiv.warn import Code
 
 SCALE = 0.002
@@ -27,8 +26,7 @@ def labels(angle_deg, stated):
     points = points * stated
     dots = SimpleNamespace(points_mm=points, pupil_mm=pupil, array_mm=array, dot=np.arange(len(points)) // 8)
     lens = fit_thin_lens(points, pupil, array, camera)
-    lattice = LensLattice(origin_mm=(0.0, 0.0), basis_mm=((0.1, 0.0), (0.0, 0.1)))
-    return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=camera.pupil_radius_mm, lattice=lattice)
+    return CameraLabels(dots=dots, lens=lens, pupil_radius_mm=camera.pupil_radius_mm, pitch_mm=0.1)
 
 
 def told(angles, stated):

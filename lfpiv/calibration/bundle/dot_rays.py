@@ -9,7 +9,6 @@ import numpy as np
 
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.thin_lens_model import ThinLensModel
-from lfpiv.geometry.optics import LensLattice, spread_over_pupil
 
 ORDERS = (4, 3, 2, 1)
 """Orders in (s, t) of the cameras' smooth departure, best first."""
@@ -19,8 +18,6 @@ LEAST_DOTS = 24
 """Least number of dots of a camera."""
 LEAST_LABELS = 10
 """Least number of labels of a dot."""
-WAVES = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2)])
-"""Waves of the errors of labels: numbers of periods along both vectors of the lattice of microlenses."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,8 +30,8 @@ class CameraLabels:
     """Thin lens fitted to the labels."""
     pupil_radius_mm: float
     """Radius of the main lens's pupil [mm]."""
-    lattice: LensLattice
-    """Lattice of the microlenses."""
+    pitch_mm: float
+    """Microlens pitch [mm]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +40,7 @@ class DotRays:
 
     lens: ThinLensModel
     pupil_radius_mm: float
-    lattice: LensLattice
+    pitch_mm: float
     dot: np.ndarray  # numbers of the dots, (d,)
     rays: np.ndarray  # position of the chief ray, slopes along u and v to the pupil's edge [mm], (d, 3, 2)
     variance: np.ndarray  # relative variance of the chief ray and of the slopes, (d, 2)
@@ -71,23 +68,9 @@ class DotRays:
             variance[k] = spread[0], spread[1:3].mean()
         variance = (1 + variance / np.median(variance, axis=0)) / 2 if len(parts) else variance
         return cls(
-            lens=camera.lens, pupil_radius_mm=radius, lattice=camera.lattice,
+            lens=camera.lens, pupil_radius_mm=radius, pitch_mm=camera.pitch_mm,
             dot=number[enough], rays=rays, variance=variance,
         )  # fmt: skip
-
-    def lens_terms(self) -> np.ndarray:
-        """Return the columns of errors of labels that are periodic over the array, shape (3d, 2 WAVES).
-
-        A model dot of the wrong size or blur is fitted in the wrong place where the edge of a lens cuts its light. At
-        the lattice coordinates g of a ray the columns are cos(2 pi k.g) and sin(2 pi k.g) for the waves k. Rows are
-        chief rays and slopes along u and v, as a quadratic fit over the pupil finds them.
-        """
-        origin, steps = np.asarray(self.lattice.origin_mm), np.linalg.inv(np.asarray(self.lattice.basis_mm)) @ WAVES.T
-        pupil = spread_over_pupil(1.0)
-        ray = self.rays[:, :1] - origin + np.einsum("nk,dka->dna", pupil, self.rays[:, 1:])
-        waves = np.exp(2j * np.pi * ray @ steps)
-        fitted = np.einsum("kn,dnw->kdw", np.linalg.pinv(_pupil_terms(pupil)[:, :6])[:3], waves)
-        return np.concatenate([fitted.real, fitted.imag], axis=2).reshape(-1, 2 * len(WAVES))
 
     def of_planes(self, planes: np.ndarray, board: DotBoard) -> DotRays:
         """Return the dots of some planes, given as bool, shape (plane,)."""

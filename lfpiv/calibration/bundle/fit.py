@@ -10,10 +10,8 @@ fit is a linear mixed model ([1]_): free coefficients of a and b for each camera
 effects, with one variance for each kind of error. A kind that does not raise the likelihood significantly has variance
 0, so that its errors are 0.
 
-Errors of the labels may have the form of errors of dots. Dots that are taken for too large or too small are fitted in
-the wrong place within their lenses, and all planes and cameras may show a row of dots at the same place. Such errors
-are periodic over the array, with free coefficients for each camera (`DotRays.lens_terms`). The noise of the labels is
-measured along s and along t: dots in step with the lenses show little of their place along one of them.
+The noise of the labels is measured along s and along t: dots in step with the lenses show little of their place along
+one of them.
 
 No camera can tell a moved, scaled or sheared world. So shifts have no part that is constant or linear in z, rotations
 no constant part, and errors of dots no part that is constant or linear in x and y.
@@ -120,15 +118,14 @@ def _no_errors(board: DotBoard) -> BoardErrors:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Equations:
-    """Linear equations of one camera: departure from the thin lens = free terms + errors of the board + noise.
+    """Linear equations of one camera: departure from the thin lens = smooth terms + errors of the board + noise.
 
-    Free are the smooth departure of the lens and errors of labels that are periodic over the array.
     Rows are the chief rays of all dots and their slopes along u and v. An error that the camera's labels of one plane
-    share, constant or linear in x or y, has a column in `free` and a row of its own. The row states that the error is
+    share, constant or linear in x or y, has a column in `smooth` and a row of its own. The row states that the error is
     0 within the noise of a dot, at least within `PLANE_ERROR_PITCH`.
     """
 
-    free: np.ndarray  # (3d + 9 planes, terms + 9 planes)
+    smooth: np.ndarray  # (3d + 9 planes, terms + 9 planes)
     effects: np.ndarray  # for s and t, (2, 3d + 9 planes, size)
     departure: np.ndarray  # for s and t [mm], (2, 3d + 9 planes)
     variance: np.ndarray  # variance of the rows, relative to that of their kind, (3d + 9 planes,)
@@ -146,7 +143,6 @@ class Equations:
         smooth = smooth_terms(data.rays, depth, data.lens)
         if smooth is None:
             return None
-        free = np.hstack([smooth, data.lens_terms()])
         moved = np.einsum("dkaj,djp->akdp", jacobian, effects.displacement(board, data.dot)).reshape(2, 3 * count, -1)
         departure = (data.rays - rays).transpose(2, 1, 0).reshape(2, -1) + moved @ values
         planes, plane = np.unique(data.dot // board.size, return_inverse=True)
@@ -156,20 +152,20 @@ class Equations:
         shared = np.kron(np.eye(3), of_plane)
         stated = shared.shape[1]
         return cls(
-            free=np.block([[free, shared], [np.zeros((stated, free.shape[1])), np.eye(stated)]]),
+            smooth=np.block([[smooth, shared], [np.zeros((stated, smooth.shape[1])), np.eye(stated)]]),
             effects=np.pad(moved, ((0, 0), (0, stated), (0, 0))),
             departure=np.pad(departure, ((0, 0), (0, stated))),
             variance=np.append(data.variance[:, [0, 1, 1]].T.ravel(), np.ones(stated)),
             kind=np.repeat([0, 1, 2, 3], [count, 2 * count, stated // 3, 2 * stated // 3]),
-            least_mm=PLANE_ERROR_PITCH * data.lattice.pitch_mm,
+            least_mm=PLANE_ERROR_PITCH * data.pitch_mm,
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WeightedEquations:
-    """Equations of one camera with weights, after the free terms are eliminated."""
+    """Equations of one camera with weights, after the smooth terms are eliminated."""
 
-    bases: tuple[np.ndarray, ...]  # for s and t: orthonormal basis of the weighted free terms, (rows, terms)
+    bases: tuple[np.ndarray, ...]  # for s and t: orthonormal basis of the weighted smooth terms, (rows, terms)
     effects: np.ndarray  # (2, rows, size)
     departure: np.ndarray  # (2, rows)
 
@@ -180,7 +176,7 @@ class WeightedEquations:
         for along in noise.T:
             of_kind = np.append(along, np.maximum(along, system.least_mm))
             root = np.sqrt(robust / system.variance) / of_kind[system.kind]
-            left, strength, _ = np.linalg.svd(system.free * root[:, None], full_matrices=False)
+            left, strength, _ = np.linalg.svd(system.smooth * root[:, None], full_matrices=False)
             roots.append(root)
             bases.append(left[:, strength > RANK_TOLERANCE * strength[0]])
         effects = [without(*part) for part in zip(bases, system.effects * np.stack(roots)[..., None], strict=True)]
