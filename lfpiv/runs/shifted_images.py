@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SHIFTS = (1, 2)
 """Distances by which images are shifted either way, the first one in any case [microlens]."""
 DOUBT = -1.0
-"""Advantage of an image shifted by a microlens from which on all frames are tried [standard errors]. Single sound
+"""Advantage of a second frame shifted by a microlens from which on all frames are tried [standard errors]. Single sound
 images have less."""
 
 Shift = tuple[str, int]
@@ -39,8 +39,8 @@ def shifted_images(shown: Shown, pairs: Sequence[int], weights: Weights, *, seri
     """
     fit = ImageFit(weights)
     axes = {name: _axis(weights, name) for name in weights.cameras}
-    first = [_gains(fit, shown, (pairs[0], frame), axes, 1) for frame in range(FRAMES)]
-    if not any(in_errors([gain]) > DOUBT for known in first for gain in known.values()):
+    first = _gains(fit, shown, (pairs[0], FRAMES - 1), axes, 1)
+    if not any(in_errors([gain]) > DOUBT for gain in first.values()):
         return None
     gains = {
         place: _gains(fit, shown, place, axes, max(SHIFTS))
