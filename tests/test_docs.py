@@ -105,8 +105,8 @@ def reader(place, brief_run, monkeypatch):
 
 
 WITH_PYTHON = [name for name, page in PAGES.items() if any(language == "python" for language, _, _ in blocks(page))]
-TRIED = []  # commands of earlier pages
 WITH_PYTHON.remove("README.md")  # `tests/runs/test_measurement.py` runs its script
+TRIED = []  # commands of earlier pages
 
 
 @pytest.mark.slow

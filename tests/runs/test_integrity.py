@@ -87,15 +87,16 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, ca
     assert rejected(caplog) == [f"pair_000{name}.nc" for name in ("0_a", "1_a", "2_b", "3_a")]
 
 
-def test_a_folder_that_is_removed_during_the_run_ends_it(small_run, tmp_path):
+@pytest.mark.parametrize("step", ["weights", "image pairs"])
+def test_a_folder_that_is_removed_during_the_run_ends_it(small_run, tmp_path, step):
     out = small_run.prepared(tmp_path / "out")
 
     def remove(now, fraction):
-        if now == "weights" and fraction > 0:
+        if now == step and fraction > 0:
             shutil.rmtree(out, ignore_errors=True)
 
     with pytest.raises(StorageError, match=r"out.*removed or renamed .*run the command again"):
-        pipeline.run(small_run.experiment, out, pairs=(0, 1), progress=remove)
+        pipeline.run(small_run.experiment, out, pairs=(0, 2), progress=remove)
 
 
 def swap_cameras(path):

@@ -94,3 +94,5 @@ def test_volumes_are_written_on_the_voxels_of_the_experiment_without_guard_layer
     assert volume.attrs["sieve_voxel"] == pytest.approx(0.6)
     assert volume.attrs["reconstruction_voxel_mm"] == pytest.approx(experiment.grid.voxel_mm / 1.25)
     assert "vectors of pair 0" in pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)["reused"]
+    file.write_text(text.replace("[smart]\n", "[smart]\nrefinement = 1.5\nsieve_voxel = 0.6\n"))
+    assert "vectors of pair 0" not in pipeline.run(file, out, pairs=(0, 1), keep_volumes=True)["reused"]

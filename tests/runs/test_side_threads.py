@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from support.small_run import PAIRS, same_vectors
+from support.small_run import PAIRS, damage, same_vectors
 
 from lfpiv.errors import InputError, StorageError
 from lfpiv.experiment.experiment import Experiment
@@ -87,3 +87,28 @@ def test_a_run_reads_ahead_and_writes_behind_with_the_same_results(small_run, tm
     assert {frame.number // 2 for frame, thread in readers if thread == READER} == set(range(1, PAIRS))
     assert writers == {WRITER}
     assert len(list((out / "volumes").iterdir())) == 2 * PAIRS
+
+
+@pytest.mark.slow
+def test_a_damaged_image_fails_its_pair_and_a_full_disk_the_run_at_its_pair(small_run, tmp_path, monkeypatch):
+    file, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    damage(sorted((file.parent / "particles").rglob("*0002*"))[0])
+    inner = PairFiles.write_vectors
+
+    def full(self, *arguments):
+        if self.pair == 3:
+            raise OSError(28, "No space left on device")
+        inner(self, *arguments)
+
+    monkeypatch.setattr(PairFiles, "write_vectors", full)
+    summary = pipeline.run(file, out)
+    assert [entry["pair"] for entry in summary["failed"]] == [2, 3]
+    assert [entry["pair"] for entry in summary["pairs"]] == [0, 1]
+
+    def storage(self, *arguments):
+        raise StorageError(f"{self.vectors}: cannot be written")
+
+    monkeypatch.setattr(PairFiles, "write_vectors", storage)
+    with pytest.raises(StorageError, match=r"pair_0003\.nc"):
+        pipeline.run(file, out, pairs=(3, None))
+    assert not list(out.rglob("*.tmp")) and not (out / "vectors" / "pair_0003.nc").exists()
