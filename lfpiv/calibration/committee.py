@@ -39,7 +39,7 @@ RAYS = 2000
 """Rays on which networks are compared."""
 FEWEST_DOTS = 40
 """Least number of dots that are halved."""
-SPLITS = 3
+SPLITS = 5
 """Pairs of halves to take where the first pair is further apart than the held-out dots allow: the network of a half may
 be unlucky."""
 CHANCE = 1e-3

@@ -130,7 +130,7 @@ def test_half_the_distance_of_two_halves_is_the_error_that_noise_makes():
 @pytest.mark.parametrize(("held_out", "expected"), [(10.0, 9.0), (8.0, 1.0)])
 def test_halves_further_apart_than_held_out_dots_allow_are_outvoted(held_out, expected):
     """The first half is displaced by 18, and half of the distance counts."""
-    displaced = iter([18.0, 0.0, 2.0, 0.0, 0.0, 2.0])
+    displaced = iter([18.0, 0.0, 2.0, 0.0, 0.0, 2.0, 2.0, 0.0, 0.0, 2.0])
 
     def fit(part):
         shift = next(displaced)

@@ -32,7 +32,7 @@ TERM_ERROR = 0.02  # of terms that are 1 at the edge: third moments of a pixel a
 STANDARD_ERRORS = 5.0  # 1e-6 chance for each of some hundred numbers
 MAPPING_PITCH = 0.006  # goal of the project; the labels' form alone left 0.005 to 0.1
 TRUE_SHARE = 1.5  # stated error over the true one, or the reverse; 0.82 to 1.15 in four rigs alike, 1.53 in a fifth
-AT_MOST = 5.0  # networks of half of this board's dots: ten pairs are .003 to .036 pitch apart, for a true error of .008
+AT_MOST = 2.0  # networks of half of this board's dots scatter by 0.02 pitch, and so does what they state: 1.8 here
 PITCH = 0.1
 
 
