@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, special
@@ -279,35 +280,50 @@ def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.nda
     first, second : mapping of str to ndarray, shape (rows, columns)
         Images of both frames, camera -> image without its dark level [counts].
     """
+    frames = {
+        order: {name: _BrightLight.of(image) for name, image in images.items()}
+        for order, images in (("first", first), ("second", second))
+    }
     told = []
-    for held, holding, order in ((first, second, ("first", "second")), (second, first, ("second", "first"))):
-        kept = {name: _kept(held[name], holding[name], 1.0, _LOST) for name in first}
-        for name, (share, power) in kept.items():
-            others = sorted([other for _, other in kept.values() if 2 * other > power] or [power])
+    for held, holding in (("first", "second"), ("second", "first")):
+        ratios = {name: light.mean and frames[holding][name].mean / light.mean for name, light in frames[held].items()}
+        for name, light in frames[held].items():
+            others = sorted(ratio for ratio in ratios.values() if 2 * ratio > ratios[name]) or [ratios[name]]
             pulses = others[(len(others) - 1) // 2]
-            back, _ = _kept(holding[name], held[name], _DIMMER, _LOST_BACK)
+            share = light.kept(frames[holding][name], 1.0, _LOST)
+            back = frames[holding][name].kept(light, _DIMMER, _LOST_BACK)
             if share > HELD * pulses and back * pulses < ALIKE * share / pulses:
-                told.append((share / pulses, order, name))
-    clearest = max(told, default=(0.0, ("", ""), ""))[1]  # beside a camera whose light grew, others seem to lose light
+                told.append((share / pulses, held, holding, name))
+    clearest = max(told, default=(0.0, "", "", ""))[1]  # beside a camera whose light grew, others seem to lose light
     return [
-        Warning(code=Code.DOUBLE, subject=name, figures={"held": order[0], "holding": order[1]})
-        for _, order, name in told
-        if order == clearest
+        Warning(code=Code.DOUBLE, subject=name, figures={"held": held, "holding": holding})
+        for _, held, holding, name in told
+        if held == clearest
     ]
 
 
-def _kept(image: np.ndarray, other: np.ndarray, level: float, lost: float) -> tuple[float, float]:
-    """Return the share of their light that all but a part `lost` of bright pixels keep in another frame.
+@dataclass(frozen=True, eq=False)
+class _BrightLight:
+    """Pixels of a frame, a sample of them in large images, and what its brightest ones show."""
 
-    Pixels count from `level` times the brightness of the brightest ones on. The second value is the ratio of bright
-    light.
-    """
-    one, two = (frame.ravel()[:: 1 + frame.size // _BRIGHT_SAMPLES] for frame in (image, other))
-    least_one, least_two = (max(level * float(np.quantile(values, _BRIGHT)), 1e-9) for values in (one, two))
-    bright, others = one >= least_one, two >= least_two
-    if not (bright.any() and others.any()):
-        return 0.0, 0.0
-    return float(np.quantile(two[bright] / one[bright], lost)), float(two[others].mean() / one[bright].mean())
+    pixels: np.ndarray  # [counts], (n,)
+    level: float  # of the dimmest of the brightest pixels [counts]
+    mean: float  # of the brightest pixels, 0 without any [counts]
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> _BrightLight:
+        pixels = image.ravel()[:: 1 + image.size // _BRIGHT_SAMPLES]
+        level = max(float(np.quantile(pixels, _BRIGHT)), 1e-9)
+        bright = pixels[pixels >= level]
+        return cls(pixels, level, float(bright.mean()) if bright.size else 0.0)
+
+    def kept(self, other: _BrightLight, level: float, lost: float) -> float:
+        """Return the share of their light that all but a part `lost` of bright pixels keep in another frame.
+
+        Pixels count from `level` times the brightness of the brightest ones on. Without any the share is 0.
+        """
+        bright = self.pixels >= level * self.level
+        return float(np.quantile(other.pixels[bright] / self.pixels[bright], lost)) if bright.any() else 0.0
 
 
 def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[Warning]:
