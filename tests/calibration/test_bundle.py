@@ -118,6 +118,14 @@ def test_a_perfect_board_is_not_corrected_where_dots_are_seen_worse_along_rows(c
     assert found.corrected == ()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_perfect_board_is_not_corrected_where_all_dots_stand_at_one_place_within_their_lenses(seed):
+    """Dots are five lenses apart along both directions, to a camera that looks along z."""
+    board = DotBoard(dots=(5, 5), spacing_mm=0.5, diameter_mm=0.1, planes_mm=(-1.0, -0.5, 0.0, 0.5, 1.0))
+    none = np.zeros((len(board.planes_mm), 6)), np.zeros((board.size, 2))
+    assert fitted(true_points(*none, board), (0.0,), seed=seed, board=board).corrected == ()
+
+
 @pytest.mark.slow(but="two cameras-aberrated")
 @pytest.mark.parametrize("optics", ["ideal", "aberrated"])
 @pytest.mark.parametrize("cameras", ANGLES)
