@@ -53,6 +53,11 @@ class Verdict(enum.Enum):
         "move as far as is searched (correlation.max_displacement_voxel, by default a quarter of the first window)"
     )
     FAILED = "hardly any vector is valid: check that both volumes show the same particles and that displacements fit"
+    UNCONFIRMED = (
+        "both volumes show the same particles, but hardly any vector confirms its neighbours: displacements change too "
+        "much from vector to vector, or ghosts hide them. Use smaller windows, whose vectors lie closer "
+        "(correlation.windows), or a shorter dt_s; in a smooth flow more light or less seeding"
+    )
     TOO_FAR = (
         "particles move farther than is searched, so that valid vectors may be chance: raise "
         "correlation.max_displacement_voxel, use a larger first window, or a shorter dt_s"
@@ -184,6 +189,8 @@ def correlate(
     if verdict is not Verdict.GOOD:
         if moves_beyond(pair.first, pair.second, first_search):
             verdict = Verdict.TOO_FAR
+        elif verdict is Verdict.FAILED and measurable.any() and pair.in_common():
+            verdict = Verdict.UNCONFIRMED
         warn(log, Warning(code=Code.FEW_VALID, figures={"share": share, "verdict": verdict.value}))
     if voxels.unseeded is not None and voxels.unseeded_fraction >= LEAST_TOLD:
         log.info("correlation: %.0f %% of the volume holds no particles", 100 * voxels.unseeded_fraction)

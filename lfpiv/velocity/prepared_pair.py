@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lfpiv.velocity import common_particles
 from lfpiv.velocity.coverage import Voxels
-from lfpiv.velocity.multi_pass import Pass
+from lfpiv.velocity.multi_pass import Pass, UndeformedPair
 from lfpiv.velocity.seeding import unseeded_voxels
-from lfpiv.velocity.settings import CorrelationSettings
+from lfpiv.velocity.settings import CorrelationSettings, triple
 from lfpiv.velocity.standing_light import on_standing_light
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
@@ -74,6 +75,12 @@ class PreparedPair:
     second: DeviceArray
     voxels: Voxels
     settings: CorrelationSettings
+
+    def in_common(self) -> bool:
+        """Return whether both volumes clearly show the same particles."""
+        pair = UndeformedPair((self.first, self.second), self.voxels.solid_on_device)
+        window = self.settings.windows[-1]
+        return common_particles.in_common(pair, window, self.settings.first_search(triple(self.first.shape)))
 
     def without_standing_light(self, last: Pass) -> Pass:
         """Return the last pass without the vectors of windows in which light brighter than particles stays in place."""

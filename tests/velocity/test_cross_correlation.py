@@ -224,6 +224,26 @@ def test_displacements_beyond_the_search_are_recognised():
         assert lost in (Verdict.FAILED.value, Verdict.POOR.value)
 
 
+def test_vectors_too_far_apart_to_confirm_each_other_are_told_from_unlike_volumes():
+    shape, wide, narrow = (17, 25, 33), ((14, 18, 18), (12, 14, 14), (12, 14, 14)), ((10, 12, 12), (8, 10, 10))
+    middle = (np.array(shape) - 1) / 2
+
+    def swirl(position):
+        z, _, x = np.moveaxis(position - middle, -1, 0)
+        rate = np.exp(0.5 - (z**2 + x**2) / 32)  # 4 voxels at a radius of 4
+        return np.stack([rate * x, 0 * x, -rate * z], -1)
+
+    for seed in (70, 71, 72):
+        first, second = particle_pair(shape, swirl, seed=seed)
+        result = correlate((first, second), windows=wide, max_displacement_voxel=4.5)
+        assert result["valid"].size == 6 and result.attrs["verdict"] == Verdict.UNCONFIRMED.value
+        closer = correlate((first, second), windows=narrow, max_displacement_voxel=4.5)  # as the verdict advises
+        assert closer["valid"].mean() > 0.5
+        other = particle_pair(shape, swirl, seed=seed + 10)[1]
+        unlike = correlate((first, other), windows=wide, max_displacement_voxel=4.5)
+        assert unlike.attrs["verdict"] == Verdict.FAILED.value
+
+
 def test_default_windows_are_cut_to_the_volume_and_others_refused():
     first, second = volumes()
     edges = [tuple(min(edge, n) for n in first.shape) for edge in DEFAULT_WINDOWS]
