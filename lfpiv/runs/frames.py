@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -25,9 +25,8 @@ from lfpiv.progress import StepProgress, part_of
 from lfpiv.results.pair_files import FrameVolume, PairFiles, PairVolumes, VolumeFile
 from lfpiv.runs.frame_light import FrameLight, compare
 from lfpiv.runs.frame_work import FrameWork
-
-if TYPE_CHECKING:
-    from lfpiv.warn import Warning
+from lfpiv.selfcalibration.paired_frames import out_of_order, summed_light
+from lfpiv.warn import Code, Warning
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +72,8 @@ class Frames:
     held: dict[Frame, HeldFrame | Failure] = field(default_factory=dict)
     taken: list[Path] = field(default_factory=list)
     """Files of other processes that are read here and needed by no other process."""
+    summed: dict[int, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    """Instant -> light of its images summed over microlenses, of the last instants of a series."""
 
     def volumes(self, files: PairFiles, progress: StepProgress) -> PairVolumes:
         """Return the volumes of a pair and the warnings about both its frames.
@@ -152,9 +153,33 @@ class Frames:
         assert first.light is not None and second.light is not None
         found = compare(self.work.cameras, first.light, second.light)
         if shared:
-            return found
+            return [*found, *self._out_of_order(first.light, second.light)]
         first.light = replace(first.light, warnings=(*first.light.warnings, *found))
         return ()
+
+    def _out_of_order(self, first: FrameLight, second: FrameLight) -> list[Warning]:
+        """Return the warnings about cameras whose first image of two stands out of order beside the one before it."""
+        number, recording, cameras = first.frame.number, self.work.experiment.recording, self.work.cameras
+        previous, begins = 2 * number - second.frame.number, not self.summed
+        for light in (first, second):
+            if light.frame.number not in self.summed:
+                self.summed[light.frame.number] = summed_light(light.images, cameras)
+        self.summed = {known: found for known, found in self.summed.items() if known >= previous}
+        if previous not in self.summed:
+            if not begins or previous not in recording.frames:  # it failed, or is none
+                return []
+            try:
+                again = self.work.light_again(recording.frame(previous))
+            except InputError as error:  # its own pair fails
+                log.debug("the order of %s is not judged: %s", first.frame.label, error)
+                return []
+            self.summed[previous] = summed_light(again.images, cameras)
+        before, image, after = (self.summed[known] for known in (previous, number, second.frame.number))
+        return [
+            Warning(code=Code.OUT_OF_ORDER, subject=name, instants=(number,))
+            for name in cameras
+            if out_of_order(before[name], image[name], after[name])
+        ]
 
     def _hand_on(self, files: PairFiles, new: Sequence[HeldFrame]) -> None:
         """Start to write new volumes where they are wanted."""

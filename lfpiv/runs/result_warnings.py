@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from lfpiv.calibration.camera import Calibration
 
 
-def copied_warnings(copies: Mapping[int, int], noun: str) -> list[Warning]:
-    """Return the warnings about pairs with an image of another pair."""
+def copied_warnings(copies: Mapping[int, int], *, series: bool) -> list[Warning]:
+    """Return the warnings about pairs with an image of another pair; `series`: pairs of instants."""
+    noun = "the pair that begins with instant" if series else "pair"
     return gather(
         Warning(code=Code.COPIED, pairs=(pair,), figures={"first": first, "noun": noun})
         for pair, first in sorted(copies.items())

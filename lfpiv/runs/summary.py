@@ -317,7 +317,7 @@ def _warnings(
         *map(Warning.from_json, () if contents.vectors else weights.get("refusals", ())),
         *contents.background_warnings,
         *of_pairs,
-        *copied_warnings(contents.copies, experiment.noun),
+        *copied_warnings(contents.copies, series=experiment.recording.is_series),
         *done.warnings,
     ]
     by_sentence: dict[str, Warning] = {}

@@ -19,6 +19,8 @@ ALIKE = 0.15
 """Least likeness of frames that show the same particles, above the likeness of other frames."""
 UNLIKE = 1 / 3
 """Most likeness of the frames of a wrong pair above chance, relative to the frames that belong together."""
+OUT_OF_ORDER = 1.8
+"""Least ratio of what neighbouring images lack in correlation to what the images on either side of one lack."""
 
 
 def likeness(
@@ -26,6 +28,25 @@ def likeness(
 ) -> float:
     """Return the highest correlation of two frames over displacements, a mean over the cameras."""
     return float(np.mean([_highest(first[name], second[name], camera) for name, camera in cameras.items()]))
+
+
+def summed_light(images: Mapping[str, np.ndarray], cameras: Mapping[str, CalibratedCamera]) -> dict[str, np.ndarray]:
+    """Return the light of each camera's image, summed over squares of a microlens, for `out_of_order`."""
+    return {name: _summed(image, round(cameras[name].optics.microimage_pitch_px)) for name, image in images.items()}
+
+
+def out_of_order(before: np.ndarray, image: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether the images of a camera before and after one are clearly more like each other than like it.
+
+    Particles that move on are the less alike, the more time is between two images. Images are from `summed_light`.
+    """
+    apart = max(_unlike(before, image), _unlike(image, after))
+    return apart > OUT_OF_ORDER * _unlike(before, after)
+
+
+def _unlike(one: np.ndarray, other: np.ndarray) -> float:
+    """Return how far the correlation of two images is below 1, at rest."""
+    return 1 - float(np.vdot(one, other)) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-30)
 
 
 def _highest(first: np.ndarray, second: np.ndarray, camera: CalibratedCamera) -> float:

@@ -70,6 +70,7 @@ class Code(enum.Enum):
     FEW_VALID = "few_valid"
     NOT_FOLLOWED = "not_followed"
     REPEATED = "repeated"
+    OUT_OF_ORDER = "out_of_order"
     UNSEEDED = "unseeded"
     REVERSED = "reversed"
     STILL = "still"
@@ -298,6 +299,10 @@ SENTENCES: Mapping[Code, str] = {
     Code.REPEATED: (
         "the image of {camera} is the one of instant {before}, pixel by pixel, so the volume starts from its images "
         "alone. Check the recording for repeated images"
+    ),
+    Code.OUT_OF_ORDER: (
+        "the images before and after it are more like each other than like it: images of this camera are out of order "
+        "or repeated, and vectors there are wrong. Check the numbers of its images"
     ),
     Code.FEW_VALID: "{share:percent} % of the vectors are valid; {verdict}",
     Code.TIME: (
