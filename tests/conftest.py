@@ -139,7 +139,7 @@ def small_run(tmp_path_factory, device):
 
 @pytest.fixture
 def brief_run(monkeypatch):
-    """Leave out of runs what `leave_out` does."""
+    """Run without report, comparison of cameras and odd pairs."""
     from support.small_run import leave_out
 
     leave_out(monkeypatch.setattr)

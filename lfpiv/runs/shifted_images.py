@@ -1,8 +1,8 @@
 """Find a camera whose images are shifted by whole microlenses in the plane of the lines of sight.
 
-Its white image does not show such a shift, and to the other cameras it is another depth. But each camera sees depths
-itself: the images leave less light unexplained when they are shifted back. First and second frames of a sound camera
-do so alike, so a shift of either frame stands out against the other one.
+Its white image does not show such a shift. The other cameras see the shifted particles at another depth. But each
+camera sees depths by itself, so images that are shifted back leave less light unexplained. In a sound pair a trial
+shift changes both frames alike. Where only one frame is shifted, the frames differ.
 """
 
 from __future__ import annotations

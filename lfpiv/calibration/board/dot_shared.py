@@ -256,9 +256,10 @@ def _common_bend(
 
 
 def estimate_diameter(shared: SharedParameters, fits: Sequence[DotFit | None]) -> SharedParameters:
-    """Return the shared parameters with the diameter that all dots show by their `fits`, one step from `shared`.
+    """Return the shared parameters with the diameter that all dots show.
 
-    Blur and bend stay: where rays are bent more than the bend can say, diameter and blur stand for it together.
+    `fits` are the fits of all dots by `shared`. One Gauss-Newton step finds the diameter. Blur and bend stay: fitted
+    along with the diameter, the blur takes what the bend cannot describe.
     """
     sure, _ = _typical(fits)
     change = sum(fit.pull[0] for fit in sure) / max(sum(fit.pull_information[0, 0] for fit in sure), 1e-12)
