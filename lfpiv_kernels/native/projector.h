@@ -222,7 +222,7 @@ LFPIV_INLINE void scatter(const VoxelBlocks& blocks, float intensity, float* ray
 }
 
 /// Blocks of weights whose rows of rays are counted and copied, set by set. A row of pixels under a lens is in set
-/// (row modulo `sets`).
+/// (row modulo `sets`). Rows of profiles have their products, a level as large as the largest level times one.
 struct SplitBlocks {
     const int* first_block;
     const int64_t* first_value;
@@ -232,16 +232,38 @@ struct SplitBlocks {
     const unsigned char* value;
     int edge;  // rays in a row of a microimage, and rows
     int sets, voxels;
+    int profile_levels;  // largest level of a profile; 0 where blocks have a value for each ray
 
-    /// Call work(set, ray, levels, columns) for each row of a voxel's blocks.
+    /// Call work(set, ray, levels, columns) for each row of a voxel's blocks. Rows of profiles without light are left
+    /// out.
     template <class Work>
     LFPIV_INLINE void for_rows(int voxel, Work work) const {
         const unsigned char* level = value + first_value[voxel];
         for (int block = first_block[voxel]; block < first_block[voxel + 1]; ++block) {
             const int columns = width[block], row = ray[block] / edge % edge;
+            if (profile_levels > 0) {
+                const unsigned char* const down = level + columns;
+                for (int k = 0; k < height[block]; ++k) {
+                    unsigned char product[BLOCK_WIDTH];
+                    if (multiply(level, columns, down[k], product))
+                        work((row + k) % sets, ray[block] + k * edge, product, columns);
+                }
+                level = down + height[block];
+                continue;
+            }
             for (int k = 0; k < height[block]; ++k, level += columns)
                 work((row + k) % sets, ray[block] + k * edge, level, columns);
         }
+    }
+
+    /// Write the products of a profile across and one level down, rounded to levels; return whether one is not 0.
+    LFPIV_INLINE bool multiply(const unsigned char* across, int columns, int down, unsigned char* product_out) const {
+        bool lit = false;
+        for (int k = 0; k < columns; ++k) {
+            product_out[k] = (unsigned char)((across[k] * down + profile_levels / 2) / profile_levels);
+            lit = lit || product_out[k] > 0;
+        }
+        return lit;
     }
 };
 
@@ -256,7 +278,8 @@ LFPIV_INLINE SplitBlocks split_blocks(const Blocks& blocks) {
             blocks.value.data,
             blocks.edge,
             blocks.sets,
-            blocks.voxels};
+            blocks.voxels,
+            blocks.profile_levels};
 }
 
 /// Count a voxel's rows of each set. `count_out` must hold zeros.

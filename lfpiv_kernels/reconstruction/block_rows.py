@@ -2,7 +2,8 @@
 
 A row has the levels of `BLOCK_WIDTH` rays side by side; zeros fill it up. The rows of a set lie one after the other,
 voxel by voxel, so that a projection by one set reads no memory of the others. They take about twice the
-memory of the blocks, which are kept as well. The loops are C++, see ``projector.h``. A GPU has no rows.
+memory of blocks of pixels, and three times that of profiles. The blocks are kept as well. The loops are C++, see
+``projector.h``. A GPU has no rows.
 Twin: ``reference.dense``.
 """
 
@@ -15,7 +16,7 @@ from lfpiv_kernels import native
 from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.reconstruction.weight_blocks import BlockRows, Blocks
 from lfpiv_kernels.transfer import bytes_on_device, to_device
-from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH
+from lfpiv_kernels.weights.ray_model import BLOCK_WIDTH, LEVELS
 
 wp.set_module_options(native.options("projector.h"))
 
@@ -36,11 +37,12 @@ class SplitBlocks:
     edge: int
     sets: int
     voxels: int
+    profile_levels: int
 
 
 @wp.struct
 class Rows:
-    """The arrays of `BlockRows` and the voxels' scales."""
+    """The arrays of `BlockRows` and the weight of a level of each voxel."""
 
     first: wp.array(dtype=int)
     ray: wp.array(dtype=int)
@@ -112,7 +114,10 @@ def _project(
 
 
 def with_rows(blocks: Blocks, sets: int) -> Blocks:
-    """Return blocks of the form "pixels" with their rows of rays: every `sets`-th row under each lens makes a set.
+    """Return blocks with their rows of rays: every `sets`-th row under each lens makes a set.
+
+    Rows of profiles have the products rounded to levels, and rows whose products are all below half a level are left
+    out.
 
     The arrays on the device "cpu" are views of the NumPy arrays. So the kernels fill `first`, `ray` and `level`.
     """
@@ -122,6 +127,7 @@ def with_rows(blocks: Blocks, sets: int) -> Blocks:
         setattr(split, name, to_device(getattr(blocks, name), device="cpu"))
     split.value = bytes_on_device(blocks.value, "cpu")
     split.edge, split.sets, split.voxels = blocks.microimages.edge, sets, voxels
+    split.profile_levels = int(LEVELS) if blocks.form == "profiles" else 0
     first = np.zeros(sets * voxels + 1, np.int32)
     launch(Call(_count, voxels, [split], [to_device(first[1:], device="cpu")]), device="cpu")
     np.cumsum(first, out=first)  # from numbers of rows to the index of the first row
@@ -134,7 +140,9 @@ def with_rows(blocks: Blocks, sets: int) -> Blocks:
 class RowLoops:
     """Projection and back projection by the rows of one set, for the voxels first <= voxel < last, on the CPU."""
 
-    def __init__(self, rows: BlockRows, scale: np.ndarray):
+    def __init__(self, blocks: Blocks):
+        rows, scale = blocks.rows, blocks.row_scale
+        assert rows is not None
         self._rows = Rows()
         for name in ("first", "ray"):
             setattr(self._rows, name, to_device(getattr(rows, name)))

@@ -165,7 +165,7 @@ class Projector(RayProjector):
         load(_project, runtime.device().warp)  # before threads start
         if blocks.rows is not None:
             self.ray_sets = self.rows = blocks.rows.sets
-            self._row_loops = RowLoops(blocks.rows, blocks.scale)
+            self._row_loops = RowLoops(blocks)
         self._spans = self._find_spans()
         self._places = np.cumsum([0] + [stop - start for start, stop in self._spans])
         self.rays = to_device(np.empty(max(int(self._places[-1]), 1), np.float32))  # `scatter` writes it first

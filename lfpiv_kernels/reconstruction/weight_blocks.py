@@ -66,6 +66,11 @@ class Blocks:
     """The same weights by rows of pixels under every lens; None where these are not taken alone."""
 
     @property
+    def row_scale(self) -> np.ndarray:
+        """Weight of one level of `rows`, shape (voxel,), float32."""
+        return self.scale * np.float32(LEVELS) if self.form == "profiles" else self.scale
+
+    @property
     def nbytes(self) -> int:
         """Memory of all arrays [byte]."""
         names = ("first_block", "first_value", "ray", "height", "width", "value", "scale", "even_blocks", "even_values")

@@ -1,4 +1,4 @@
-"""Rows of pixels under every lens as sets of rays of weights that are stored pixel by pixel."""
+"""Rows of pixels under every lens as sets of rays of weights that are stored voxel by voxel."""
 
 import numpy as np
 import pytest
@@ -23,6 +23,9 @@ GRID = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.5, 1.4, 1.3), voxe
 SMALL = lfpiv.Grid.from_extent(centre_mm=(0, 0, 0), size_mm=(1.0, 1.0, 0.9), voxel_mm=0.05)
 ROOM = 1.5
 """Room for blocks that has none for rows: these take about twice the memory of the blocks."""
+ROUNDED = 1e-3
+"""Largest relative difference of images by rows of profiles from those by whole blocks: products are rounded to a 255th
+of the largest one."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,6 +41,20 @@ def hexagonal_rig():
         for name, yaw in (("one", 45), ("two", -45))
     }
     return IdealRig(cameras)
+
+
+def turned_rig(roll_deg=1.5):
+    cameras = {
+        name: IdealCamera(name, rotation(yaw, 0.2), optics(250, 270), lattice(roll_deg=roll_deg))
+        for name, yaw in (("one", 45), ("two", -45))
+    }
+    return IdealRig(cameras)
+
+
+@pytest.fixture(scope="module")
+def turned(device):
+    """Weights of cameras with turned arrays of square microlenses: profiles that planes cannot share."""
+    return lfpiv.build_weights(turned_rig(), GRID)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +73,21 @@ def test_rows_are_taken_alone_where_all_weights_of_a_large_volume_are_pixel_by_p
 
 def test_rows_of_pixels_see_all_of_the_light_once(hexagonal):
     assert_rows_see_all_light_once(hexagonal, least=0.8)
+
+
+def test_profiles_of_turned_arrays_have_rows(turned):
+    assert set(turned.forms.values()) == {"profiles"} and type(turned.projector("one")) is Projector
+    assert turned.rows == len(SmartSolver(turned, SmartSettings()).subsets) == ray_sets(turned.cameras)
+    assert_rows_see_all_light_once(turned, least=0.9, rounded=ROUNDED)
+
+
+def test_rows_of_profiles_have_together_the_image_of_the_blocks(turned):
+    volume = ndimage.gaussian_filter(np.random.default_rng(6).random(GRID.shape) ** 20, 0.9).astype(np.float32).ravel()
+    for name in turned.cameras:
+        projector, dark = turned.projector(name), np.zeros(turned.gain(name).size, np.float32)
+        of_rows = sum(projector.project(volume, dark.copy(), number) for number in range(turned.rows))
+        whole = projector.project(volume, dark.copy())
+        assert np.linalg.norm(of_rows - whole) < ROUNDED * np.linalg.norm(whole)
 
 
 def test_rows_that_do_not_fit_the_memory_are_left_out(hexagonal):

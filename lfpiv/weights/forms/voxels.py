@@ -66,9 +66,9 @@ class Voxels(Form):
         Rows that do not fit into the memory are left out.
         """
         rig, sets = self.rig, shared_profiles.ray_sets(self.rig.cameras)
-        alike = len(rig.cameras) > 1 and all(rig.choice(name).form == "pixels" for name in rig.cameras)
+        several = len(rig.cameras) > 1
         many = rig.stored.size >= shared_profiles.FEWEST_VOXELS and sets >= shared_profiles.FEWEST_SETS
-        if not (rig.shared and not rig.rays and alike and many and runtime.device().form == "cpu"):
+        if not (rig.shared and not rig.rays and several and many and runtime.device().form == "cpu"):
             return 1
         if max(self._sampled_rows(name) * self._places(name).size for name in self.suits) > MOST_BLOCKS:
             return 1
