@@ -28,6 +28,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from lfpiv_kernels.runtime import cores
 
+FEWEST_SHARED = 5000
+"""Samples from which on several threads sum them. To start threads takes longer than to sum fewer samples."""
 BLOCK_BYTES = 1 << 20
 """Memory of one block of Jacobian rows [byte]."""
 LEAST_ROWS = 512
@@ -200,7 +202,7 @@ def forward(layers: Sequence[np.ndarray], inputs: np.ndarray) -> list[np.ndarray
 
 
 def _sum_over_blocks(terms_of: Callable[[int, int], Terms], count: int, rows: int) -> Terms:
-    """Return the sum of ``terms_of(first, last)`` over blocks of `rows` samples, computed by several threads.
+    """Return the sum of ``terms_of(first, last)`` over blocks of `rows` samples, many samples by several threads.
 
     Each of a fixed number of ranges is summed by one thread, and the ranges are added in order. So the result does not
     depend on the number of threads. The caller limits BLAS to one thread.
@@ -214,8 +216,12 @@ def _sum_over_blocks(terms_of: Callable[[int, int], Terms], count: int, rows: in
         return total
 
     edges = [count * part // RANGES for part in range(RANGES + 1)]
-    with ThreadPoolExecutor(cores()) as pool:
-        totals = list(pool.map(add_range, [edge for edge in pairwise(edges) if edge[0] < edge[1]]))
+    ranges = [edge for edge in pairwise(edges) if edge[0] < edge[1]]
+    if count < FEWEST_SHARED:
+        totals = list(map(add_range, ranges))
+    else:
+        with ThreadPoolExecutor(cores()) as pool:
+            totals = list(pool.map(add_range, ranges))
     return tuple(sum(terms[1:], terms[0]) for terms in zip(*totals, strict=True))
 
 

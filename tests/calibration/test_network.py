@@ -166,9 +166,12 @@ def test_result_depends_on_the_seed_but_not_on_the_number_of_threads(monkeypatch
         network = train(inputs, array, TrainingSettings(hidden=(6,), epochs=12, seed=seed), groups=dot).network
         return np.concatenate([weight.ravel() for weight in network.weights])
 
-    first = trained(4)
-    monkeypatch.setattr(trainers, "cores", lambda: 1)
-    np.testing.assert_array_equal(trained(4), first)
+    first = trained(4)  # so few samples are summed by one thread
+    assert len(inputs) < trainers.FEWEST_SHARED
+    monkeypatch.setattr(trainers, "FEWEST_SHARED", 0)
+    for threads in (2, 1):
+        monkeypatch.setattr(trainers, "cores", lambda threads=threads: threads)
+        np.testing.assert_array_equal(trained(4), first)
     assert not np.array_equal(trained(5), first)
 
 
