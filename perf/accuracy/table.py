@@ -1,4 +1,4 @@
-"""Watch the accuracy of a run in twelve small cases: one to four cameras, thin and dense, blobs and points.
+"""Watch the accuracy of a run in thirteen small cases: one to four cameras, thin and dense, blobs and points.
 
     python perf/accuracy/table.py                     this checkout against the stored table
     python perf/accuracy/table.py --against COMMIT    this checkout and another one in turns, on the same images
@@ -68,11 +68,19 @@ class Case:
     blob_voxel: float = 0.7
     """Standard deviation of the Gaussian particles [voxel]; 0 for points."""
     realistic: bool = False
+    roll_deg: float = 0.0
+    """Roll of the microlens arrays, more than planes of voxels can share profiles with [degree]."""
+
+    @property
+    def rig(self) -> tuple[int, float]:
+        """What cases with one calibration have in common."""
+        return self.cameras, self.roll_deg
 
     @property
     def label(self) -> str:
         kind = f"blobs {self.blob_voxel:g}" if self.blob_voxel else "points"
-        return f"{self.cameras} cam {self.ppm:g} ppm {kind} {self.flow} {'real' if self.realistic else 'clean'}"
+        images = "real" if self.realistic else "clean"
+        return f"{self.cameras} cam {self.ppm:g} ppm {kind} {self.flow} {images}{' turned' if self.roll_deg else ''}"
 
 
 CASES = (
@@ -81,6 +89,7 @@ CASES = (
     Case(cameras=1, ppm=0.3, flow="ring", realistic=True),
     Case(cameras=2, ppm=0.1, flow="shear", blob_voxel=0.0),
     Case(cameras=2, ppm=0.5, flow="swirl"),
+    Case(cameras=2, ppm=0.5, flow="swirl", roll_deg=1.5),
     Case(cameras=2, ppm=0.5, flow="ring", blob_voxel=0.0),
     Case(cameras=2, ppm=0.05, flow="swirl", realistic=True),
     Case(cameras=2, ppm=0.5, flow="shear", realistic=True),
@@ -129,7 +138,7 @@ def scene(case: Case, pairs: int, settings: dict) -> Scene:
                 "nominal_angle_deg": angle,
                 "true_yaw_deg": angle + 0.4 - 0.3 * number,
                 "true_array_offset_mm": (0.03 - 0.02 * number, -0.02 + 0.015 * number),
-                "true_array_roll_deg": 0.05 - 0.03 * number,
+                "true_array_roll_deg": case.roll_deg + 0.05 - 0.03 * number,
             }
         )
     size = {"sigma_mm": case.blob_voxel * VOXEL_MM} if case.blob_voxel else {}
@@ -204,7 +213,7 @@ def compared(ours: dict, base: dict) -> tuple[np.ndarray, np.ndarray]:
 
 def row(case: Case, ours: dict, base: dict | None) -> str:
     """Return the line of a case: rms errors of the base and ours, ratio with its interval, and verdict."""
-    text = f"{case.label:37s} " + " ".join(f"{value:6.3f}" for value in np.mean(ours["rms"], 0))
+    text = f"{case.label:41s} " + " ".join(f"{value:6.3f}" for value in np.mean(ours["rms"], 0))
     text += f"  valid {ours['valid']:.2f}  {ours['cpu_s']:6.2f} s"
     if base is None:
         return text
@@ -242,10 +251,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     table, worse = {}, 0
     chosen = [case for case in CASES if not options.case or any(text in case.label for text in options.case)]
     with checkout(options.against) if options.against else contextlib.nullcontext() as tree:
-        for count in ANGLES_DEG:
-            cases = [case for case in chosen if case.cameras == count]
-            if not cases:
-                continue
+        for rig in dict.fromkeys(case.rig for case in chosen):
+            cases = [case for case in chosen if case.rig == rig]
             plain = [experiment(case, options.pairs, {}, options.cache) for case in cases]
             bases = measure(cases, plain, tree) if tree else [stored.get(case.label) for case in cases]
             files = [experiment(case, options.pairs, settings, options.cache) for case in cases] if settings else plain
