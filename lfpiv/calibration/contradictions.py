@@ -41,12 +41,12 @@ UNFITTED_PITCH = 1.0
 NEARER_DEG = 10.0
 """Angle by which the fitted pose must be nearer to a mirror image of the stated one than to itself [degree]."""
 OTHER_ARRAY = 0.5
-"""Light between the microimages of another camera's white image, relative to the own white image, below which board
-images belong to the other camera."""
+"""Board images belong to another camera if less light falls between the microimages of its white image: at most this
+share of the light between those of the own white image."""
 BAND_ROWS = 512
 """Rows of board images that are compared, in the middle of the sensor."""
 NOISE = 0.2
-"""Correlation of diagonal neighbours in what two images of the board differ by, below which it is noise."""
+"""Two images of the board differ by noise if diagonal neighbours of their difference correlate by less."""
 SEEN = 0.5
 """Least correlation of such images, so that they show more than noise."""
 

@@ -28,7 +28,7 @@ Light = Callable[[np.ndarray], np.ndarray]
 """Takes points (particle, 3) [mm] and returns the relative light of a particle there."""
 
 SIGMAS_VOXEL = (0.0, 0.4, 0.55, 0.7, 1.0, 1.5)
-"""Standard deviations of known particles, with which recorded ones are compared [voxel]."""
+"""Standard deviations of the known particles that are compared with the recorded particles [voxel]."""
 DRAWS = 7
 """Seed of the draws of known particles."""
 REFERENCES = 3

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 
 ALIKE = 0.3
-"""Correlation of neighbouring pixels after the exchange, above which they are alike."""
+"""Bytes may be swapped where neighbouring pixels correlate by more than this once the bytes are exchanged."""
 UNLIKE = 1.5
-"""What correlation lacks from 1 as they are, relative to the same after the exchange, above which they are not."""
+"""They are swapped where one less the correlation falls at least by this factor when the bytes are exchanged."""
 LARGEST_SHARE = 0.5
-"""Share of the pixels with light whose high byte is the same, above which it is no low byte: noise would vary it."""
+"""A byte that is the same in a larger share of the lit pixels is no low byte, because noise varies a low byte."""
 ONE_HIGH_BYTE = 0.8
 """Share of the pixels with one high byte among which the low byte is judged."""
 EVEN = 0.8

@@ -50,12 +50,14 @@ ROUNDS = (
 )
 """Rounds of the fit."""
 SETTLED_VOXEL = 0.02
-"""Mean change of the displacement below which no other round follows [voxel]."""
+"""End the fit after a round with a smaller mean change of the displacement [voxel]."""
 LOST, JUDGED = 3.2, 2
-"""Misfit over that of the frames by themselves, after so many rounds, above which particles may be lost between frames.
+"""Particles may be lost between the frames if the misfit over the misfit of separate frames is larger. The second value
+is the number of rounds after which this is judged.
 """
 UNEQUAL = 0.13
-"""Rms of rho, weighted by the light, above which they are: the fit begins again with brightness that may differ."""
+"""Particles are lost if the rms of rho, weighted by the light, is larger. The fit then begins again, and the brightness
+of the frames may differ."""
 PART = 4
 """The curvature is taken from one subset of the rays in so many."""
 

@@ -39,8 +39,8 @@ from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
 
 CONTRADICTION = 8.0
-"""Displacement that is left between the frames by themselves, over the median of its standard deviation, above which
-they contradict. Ghosts leave some, up to 6 in sound pairs."""
+"""Separate frames contradict a fitted vector if they are displaced against each other by more than this many of the
+median standard deviations. Ghosts displace them by up to 6 in sound pairs."""
 ALONE_SHARE, LEFT_SHARE, LOSSY = 0.43, 0.39, 1.64
 """Standard deviation of a fitted vector: parts that the uncertainty of the frames by themselves and the displacement
 that is left between them add in squares, and the factor of both where particles are lost between the frames."""
@@ -52,7 +52,7 @@ EDGE_VOXEL = 1
 LEAST_PART = 0.25
 """Least wet part of a window by which its uncertainty is divided. Beside a wall, particles lie on one side only."""
 FARTHEST_VOXEL = 0.5
-"""Displacement that is left above which they contradict in any case [voxel]."""
+"""Separate frames that are displaced by more contradict a fitted vector in any case [voxel]."""
 FIELD_CORRELATION_VOXEL = 5.9
 """Length over which errors of the fitted displacement at single places correlate [voxel]."""
 

@@ -19,19 +19,20 @@ from lfpiv.lightfield.decoder import CORE_COVERAGE, LightFieldDecoder
 from lfpiv.lightfield.standing_light import LEAST_RATIO_PIXELS, POWER_RANGE, StandingLight, mode, nothing
 
 CHANCE = 99.99
-"""Percentile of the shifted images' minimum above which a pixel's light stands."""
+"""A pixel has standing light if it is above this percentile of the shifted images' minimum."""
 CLEAR_SIGMA = 5.0
 """Least count of a pixel with standing light in a background image [noise]."""
 NOISE_SIGMA = 3.0
 """Least count of a pixel that is counted among those brighter than chance, and least stray light [noise]."""
 LEAST_STANDING = 0.005
-"""Share of an image's light below which compact standing light is left alone: chance reaches a fifth of it."""
+"""Compact standing light is subtracted if it has a larger share of an image's light. Chance reaches a fifth of this
+share."""
 LIT_PART = 2.0
 """Sensor over the part of it on which particles are imaged, as a rough figure."""
 RARE, OFTEN = 1e-4, 10.0
 """Numbers of places with light in all images by chance: what may be neglected, and what shows how bright they are."""
 STANDS_EVERYWHERE = 0.6
-"""Share of the lit parts of a sensor above which light that stands is that of particles at rest."""
+"""Standing light in a larger share of the lit parts of a sensor comes from particles at rest."""
 
 _LEVELS = (90.0, 99.0, 99.9)  # percentiles of the chance minimum whose excess is counted around each pixel
 _REACH_PITCHES = 1.0  # half width of the square around a pixel in which excess pixels are counted

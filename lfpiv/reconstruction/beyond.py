@@ -47,7 +47,8 @@ FINE, WIDE = 0.7, 2.5
 LEAST_LIT = 0.25
 """Least profile of a layer that counts as lit, relative to the mean of the volume."""
 SIGNIFICANT, CONFIRMED = 3.8, 3.0
-"""Least light beyond a face [standard deviation of chance], and beyond further faces once there is light beyond one."""
+"""Detection limits of light [standard deviation of chance]: for the first face with light beyond it, and for the others
+after it."""
 LEAST_SEEN = 0.5
 """Least share of a layer that two cameras must see."""
 SEEN_RAYS = 0.9

@@ -33,7 +33,7 @@ from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.transfer import DeviceArray, to_device
 
 COMPARED = 8
-"""By an eighth of the subsets of all cameras guesses are compared: the first ones, which lie far apart in the pupil."""
+"""First guesses are compared on one subset in eight: the first subsets, which are far apart in the pupil."""
 FOLLOWED_STEPS = 8
 """Number of steps by subsets of all cameras from the volume of the frame before, without a sieve."""
 LEAST_PART = 0.02

@@ -29,7 +29,7 @@ WIDTH_INCH, DPI = 13.0, 100
 BRIGHT_PERCENTILE = 99.7
 """Percentile of the voxels at which the colours of a projection or a plane end."""
 CLEAR, WEAK = 0.2, 0.05
-"""Structure from which particles are clear, and below which they hardly rise above the noise."""
+"""Particles are clear above the first value of the structure, and hardly rise above the noise below the second."""
 SEVERAL_PERCENT = 0.02
 """Share of saturated pixels, of the bright ones, that is too much."""
 GOOD = "clear"

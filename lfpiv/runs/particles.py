@@ -20,8 +20,8 @@ from lfpiv.tracking.pairing import exchange
 from lfpiv.warn import Code, Warning
 
 HIDDEN, HIDDEN_ONE = 0.5, 0.14
-"""Share of particles that fewer than two cameras see alone above which particles are mixed up; the second of those that
-a single camera does not see alone."""
+"""Warn if a larger share of the particles overlaps others in all cameras, or in all but one. The second share is that
+of a single camera."""
 LEAST_FOUND = 20
 """Least number of particles in a frame that this share is judged by."""
 
@@ -34,7 +34,7 @@ class FrameFits:
     """
 
     last: tuple[Frame, Fit] | None = None
-    """The latest second frame, and its particles before those of the first frame told them where to look."""
+    """Second frame of the last pair, and its particles found without candidates from the first frame."""
 
     def of(self, search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
         """Return the particles of both frames of a pair, which the caller may change."""
@@ -84,7 +84,7 @@ def refused(table: xr.Dataset) -> xr.Dataset:
 
 
 def crowded_warnings(table: xr.Dataset, cameras: int) -> list[Warning]:
-    """Return a warning if too few cameras see particles alone for particles to be told apart."""
+    """Warn if particle images overlap in too many cameras."""
     share, limit = float(np.max(table.attrs["hidden"])), HIDDEN_ONE if cameras == 1 else HIDDEN
     if share <= limit:
         return []

@@ -56,9 +56,9 @@ the lines of sight and across it [voxel]."""
 FLATTEST = 1e-3
 """Least curvature of a peak, as a share of the largest one."""
 NEARLY_PARALLEL = 0.3
-"""Singular value of two lines of sight below which they count as parallel: about 25 degrees between them."""
+"""Two lines of sight count as parallel if their smaller singular value is less: some 25 degrees between them."""
 LEVEL = 0.1
-"""Square of the sine below which the lines of sight count as normal to y: 18 degrees."""
+"""The lines of sight count as normal to y if the square of the sine is less: 18 degrees."""
 SIGNIFICANT = 1.5
 """Least ratio of a peak to the highest coefficient with one volume mirrored, which is due to chance."""
 SAME_VOXEL = 2.0

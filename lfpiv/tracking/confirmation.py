@@ -37,7 +37,7 @@ LEAST_TELLING = 3
 LEFT_RATIO = 2.0
 """Light that a particle must have beside brighter ones, over what the usual error of the model leaves of them."""
 MISFIT_RATIO = 8.0
-"""Light that a particle's pixels lack, relative to the error of the model, above which it is none."""
+"""A particle is rejected if its pixels lack more light than this many errors of the model."""
 LACKING_SIGMA = 5.0
 """Significance that such an error must have [standard error]."""
 USUAL_ERROR = 0.05

@@ -16,7 +16,7 @@ OUTLIER_SIGMA = 5.0
 SIZE_STEP = 1.25
 """Ratio of the sizes that are compared."""
 CLEAR_OVERLAP = 0.3
-"""Overlap of a particle's image with another one above which it does not tell the size."""
+"""A particle whose image overlaps another image by more is not used to find the size."""
 LEAST_CLEAR, MOST_CLEAR = 8, 100
 """Least and largest number of particles that tell the size."""
 WEAK = 0.5

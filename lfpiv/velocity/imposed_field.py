@@ -28,7 +28,7 @@ LEVEL = 1e6
 
 
 class ImposedField:
-    """Displacement at any place of the volume that the windows cover; beyond it that of the nearest place.
+    """Displacement inside the windows; constant extrapolation outside.
 
     Parameters
     ----------

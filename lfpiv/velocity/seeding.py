@@ -32,7 +32,8 @@ SURE = 4.0
 """Least mean light of the first volume over coarse cells that shows particles everywhere, as a multiple of `DARK` of
 the brightest mean. The mean of both volumes is then above twice `DARK`."""
 SAMPLE, FEWEST_PLANES, FEWEST_PEAKS = 1 << 16, 4, 256
-"""Voxels and least planes in which local maxima are sought first, and their number below which all are searched."""
+"""Local maxima are sought in so many voxels first, and in so many planes at least. All voxels are searched if fewer
+maxima than the third value are found there."""
 _TINY = float(np.finfo(np.float32).tiny)
 
 

@@ -23,7 +23,7 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 CLEAR = 1.05
 """Least ratio of light by which a mistake must surpass what is stated."""
 SHARP = 0.5
-"""Light of the best mistake in air over the light of the board behind a liquid, below which there is a liquid."""
+"""The board is behind a liquid if the best mistake in air has less than this share of the contrast that a liquid has."""
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
 

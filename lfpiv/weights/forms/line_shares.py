@@ -15,7 +15,7 @@ import numpy as np
 LINES = 6
 """Lines of sight among which a voxel is shared along an axis."""
 BEFORE = LINES // 2 - 1
-"""Lines before the last one that lies not behind the voxel."""
+"""Lines of sight used below a voxel, beside the nearest line."""
 VARIANCE_VOXEL = 0.8
 """Variance of the image of a blob across the line of sight that the shares are made for [voxel^2]."""
 
