@@ -23,7 +23,7 @@ from lfpiv.lightfield.decoder import LightFieldDecoder
 CLEAR = 1.05
 """Least ratio of light by which a mistake must surpass what is stated."""
 SHARP = 0.5
-"""The board is behind a liquid if the best mistake in air has less than this share of the contrast that a liquid has."""
+"""The board is behind a liquid if the best mistake in air has less than this share of the contrast in a liquid."""
 ALIKE_DEG = 20.0
 """Largest angle between two orientations, each correct to ten degrees, that may be the same [degree]."""
 
