@@ -86,7 +86,7 @@ class RayPart:
         for camera, ray_set in subset.parts:
             self._sets[names[camera]].append(ray_set)
         self._pixels = {
-            name: np.concatenate([weights.projector(name).see_only(one) for one in sets])
+            name: np.concatenate([weights.projector(name).exclusive_pixels(one) for one in sets])
             for name, sets in self._sets.items()
             if sets
         }

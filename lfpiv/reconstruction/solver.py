@@ -145,8 +145,8 @@ class SmartSolver:
     def _sees_alone(self, name: str) -> bool:
         """Return whether most of a camera's pixels see a single set of rays, and each set has some."""
         projector = self.weights.projector(name)
-        alone = [len(projector.see_only(number)) for number in range(projector.ray_sets)]
-        return min(alone) > 0 and sum(alone) >= LEAST_ALONE * len(projector.see_only(ALL))
+        alone = [len(projector.exclusive_pixels(number)) for number in range(projector.ray_sets)]
+        return min(alone) > 0 and sum(alone) >= LEAST_ALONE * len(projector.exclusive_pixels(ALL))
 
     def _sieve_and_cap(self, images: Mapping[str, np.ndarray]) -> tuple[Sieve, float]:
         """Return the sieve and the limit of the counts. Those that the settings leave open follow from the images."""

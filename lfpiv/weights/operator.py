@@ -227,7 +227,7 @@ class Weights(Shown):
     def sums_of_set(self, name: str, ray_set: int) -> np.ndarray:
         """Sum each voxel's weights over one camera's pixels that see one set of rays only: (voxel,), stored order."""
         projector, gain = self.projector(name), self.gain(name)
-        pixels = projector.see_only(ray_set)
+        pixels = projector.exclusive_pixels(ray_set)
         image, sums = np.zeros_like(gain), np.zeros(self.grid.size, np.float32)
         image[pixels] = gain[pixels]
         return projector.back_project(image, sums, ray_set)
@@ -236,7 +236,7 @@ class Weights(Shown):
         """Return the light of an evenly lit volume in a camera's pixels that see one set of rays only, shape (set,)."""
         projector, gain = self.projector(name), self.gain(name)
         image = projector.project(np.ones(self.grid.size, np.float32), np.zeros_like(gain))
-        pixels = [projector.see_only(number) for number in range(projector.ray_sets)]
+        pixels = [projector.exclusive_pixels(number) for number in range(projector.ray_sets)]
         return np.array([(gain[own] * image[own]).sum(dtype=np.float64) for own in pixels])
 
     @property

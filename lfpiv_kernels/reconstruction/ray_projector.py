@@ -129,7 +129,7 @@ class RayProjector:
                 self.gather(out, ray_set=ray_set)
         return out
 
-    def see_only(self, ray_set: int) -> np.ndarray:
+    def exclusive_pixels(self, ray_set: int) -> np.ndarray:
         """Return the sensor pixels that see light by rays of one set and of no other one, shape (pixel,), int32."""
         rays = self.map.of(ray_set)
         return self.map.pixel[rays.start : rays.end]

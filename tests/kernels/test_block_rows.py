@@ -105,4 +105,4 @@ def test_sets_share_out_the_pixels(rig):
     for number in range(cut.rows.sets):
         others = np.unique(microimages.pixel[lit & (set_of != number)])
         own = np.setdiff1d(microimages.pixel[lit & (set_of == number)], others)
-        np.testing.assert_array_equal(np.sort(projector.see_only(number)), own)
+        np.testing.assert_array_equal(np.sort(projector.exclusive_pixels(number)), own)

@@ -169,7 +169,7 @@ def test_a_comparison_takes_the_pixels_of_a_set_and_writes_apart_from_the_light(
         comparison.compare(to_device(volume, float), totals, number)
         light = np.where(projector._of(number), projector.matrix @ volume, to_host(projector.rays))
         np.testing.assert_allclose(to_host(projector.rays), light, rtol=TOLERANCE_SUM)
-        pixels = projector.see_only(number)
+        pixels = projector.exclusive_pixels(number)
         expected, counts = gain[pixels] * (matrix[pixels] @ volume) + floor, image[pixels] + floor
         squares, divergence = np.square(counts - expected), expected * np.log(expected / counts) - expected + counts
         assert len(pixels) and totals.read() == pytest.approx((squares.sum(), divergence.sum()), rel=TOLERANCE_MISFIT)

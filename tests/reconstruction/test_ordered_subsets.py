@@ -72,7 +72,7 @@ def test_epochs_equal_their_dense_twin(weights, subsets):
     names = list(weights.cameras)
     images = {name: rng.uniform(0, 20, camera.gain.size).astype(np.float32) for name, camera in weights.cameras.items()}
     dense = [reference.dense(weights.projector(name).blocks) for name in names]
-    pixels = [[(n, weights.projector(names[n]).see_only(part)) for n, part in one.parts] for one in subsets]
+    pixels = [[(n, weights.projector(names[n]).exclusive_pixels(part)) for n, part in one.parts] for one in subsets]
     rows = [np.concatenate([dense[n][seen] for n, seen in each]) for each in pixels]
     twin = reference.ordered_subsets(
         rows,
@@ -201,7 +201,7 @@ def test_a_change_of_the_subsets_is_no_stop_by_tolerance(volume_of_blobs):
 def test_sums_of_sets_are_those_of_the_dense_weights(weights):
     for name, camera in weights.cameras.items():
         for half in (EVEN, ODD):
-            pixels = weights.projector(name).see_only(half)
+            pixels = weights.projector(name).exclusive_pixels(half)
             expected = camera.gain.ravel()[pixels] @ reference.dense(weights.projector(name).blocks)[pixels]
             np.testing.assert_allclose(weights.sums_of_set(name, half), expected, rtol=1e-4, atol=1e-6)
 
