@@ -159,21 +159,14 @@ class Frames:
 
     def _out_of_order(self, first: FrameLight, second: FrameLight) -> list[Warning]:
         """Return the warnings about cameras whose first image of two stands out of order beside the one before it."""
-        number, recording, cameras = first.frame.number, self.work.experiment.recording, self.work.cameras
-        previous, begins = 2 * number - second.frame.number, not self.summed
+        number, cameras = first.frame.number, self.work.cameras
+        previous = 2 * number - second.frame.number
         for light in (first, second):
             if light.frame.number not in self.summed:
                 self.summed[light.frame.number] = summed_light(light.images, cameras)
         self.summed = {known: found for known, found in self.summed.items() if known >= previous}
-        if previous not in self.summed:
-            if not begins or previous not in recording.frames:  # it failed, or is none
-                return []
-            try:
-                again = self.work.light_again(recording.frame(previous))
-            except InputError as error:  # its own pair fails
-                log.debug("the order of %s is not judged: %s", first.frame.label, error)
-                return []
-            self.summed[previous] = summed_light(again.images, cameras)
+        if previous not in self.summed:  # it failed, is none, or belongs to the work before
+            return []
         before, image, after = (self.summed[known] for known in (previous, number, second.frame.number))
         return [
             Warning(code=Code.OUT_OF_ORDER, subject=name, instants=(number,))
