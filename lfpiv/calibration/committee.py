@@ -150,7 +150,8 @@ def distance_of_halves(
     region_mm, pupil_radius_mm, seed
         As `nearest_to_others` takes them.
     held_out : float
-        Error of held-out dots. A first pair of halves with a larger error is one of `SPLITS`, whose median counts.
+        Error of held-out dots. A first pair of halves with a larger error is followed by others, `SPLITS` in all. Then
+        the median of the others counts, because the first one was chosen for its large error.
 
     Returns
     -------
@@ -166,7 +167,7 @@ def distance_of_halves(
         rays = rng.uniform(low, high, (RAYS, 3)), random_on_pupil(INNER * pupil_radius_mm, RAYS, rng)
         apart = fit(half)(*rays) - fit(~half)(*rays)
         errors.append(float(np.linalg.norm(apart, axis=1).mean() / 2))
-    return float(np.median(errors))
+    return float(np.median(errors[1:] or errors))
 
 
 def smooth_departure(inputs: np.ndarray, departure: np.ndarray, dot: np.ndarray) -> float:
