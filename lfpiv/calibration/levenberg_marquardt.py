@@ -29,7 +29,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from lfpiv_kernels.runtime import cores
 
 FEWEST_SHARED = 5000
-"""Samples from which on several threads sum them. To start threads takes longer than to sum fewer samples."""
+"""Sum fewer samples by one thread: starting threads takes longer."""
 BLOCK_BYTES = 1 << 20
 """Memory of one block of Jacobian rows [byte]."""
 LEAST_ROWS = 512

@@ -12,7 +12,7 @@ import numpy as np
 ALIKE = 0.3
 """Bytes may be swapped where neighbouring pixels correlate by more than this once the bytes are exchanged."""
 UNLIKE = 1.5
-"""They are swapped where one less the correlation falls at least by this factor when the bytes are exchanged."""
+"""They are swapped where the exchange divides 1 - correlation by more than this."""
 LARGEST_SHARE = 0.5
 """A byte that is the same in a larger share of the lit pixels is no low byte, because noise varies a low byte."""
 ONE_HIGH_BYTE = 0.8

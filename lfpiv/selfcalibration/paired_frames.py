@@ -46,7 +46,12 @@ def out_of_order(before: np.ndarray, image: np.ndarray, after: np.ndarray) -> bo
 
 def _unlike(one: np.ndarray, other: np.ndarray) -> float:
     """Return how far the correlation of two images is below 1, at rest."""
-    return 1 - float(np.vdot(one, other)) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-30)
+    return 1 - float(np.vdot(one, other)) / _norms(one, other)
+
+
+def _norms(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the product of the norms of two images, at least a number above 0."""
+    return max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-30)
 
 
 def _highest(first: np.ndarray, second: np.ndarray, camera: CalibratedCamera) -> float:
@@ -55,7 +60,7 @@ def _highest(first: np.ndarray, second: np.ndarray, camera: CalibratedCamera) ->
     shape = [2 * count for count in one.shape]
     product = fft.irfft2(fft.rfft2(one, shape).conj() * fft.rfft2(other, shape), shape)
     near = np.roll(product, (REACH_LENSES, REACH_LENSES), (0, 1))[: 2 * REACH_LENSES + 1, : 2 * REACH_LENSES + 1]
-    return float(near.max()) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-30)
+    return float(near.max()) / _norms(one, other)
 
 
 def _summed(image: np.ndarray, step: int) -> np.ndarray:

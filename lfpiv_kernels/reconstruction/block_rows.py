@@ -2,9 +2,8 @@
 
 A row has the levels of `BLOCK_WIDTH` rays side by side; zeros fill it up. The rows of a set lie one after the other,
 voxel by voxel, so that a projection by one set reads no memory of the others. They take about twice the
-memory of blocks of pixels, and three times that of profiles. The blocks are kept as well. The loops are C++, see
-``projector.h``. A GPU has no rows.
-Twin: ``reference.dense``.
+memory of blocks of pixels, and three to five times the memory of profiles. The blocks are kept as well. The loops are
+C++, see ``projector.h``. A GPU has no rows. Twin: ``reference.dense``.
 """
 
 from dataclasses import replace
