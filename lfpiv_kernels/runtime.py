@@ -11,7 +11,7 @@ import os
 import platform
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -260,7 +260,7 @@ def run_chunks(
     `warp_device` is Warp's name of the device that the job uses; default: the running one.
     """
     where = device()
-    if not on_threads(warp_device or where.warp):
+    if not on_threads(warp_device or where.warp) or size == chunks == 1:
         job(0, 0, size)
         return
     edges = [size * part // chunks for part in range(chunks + 1)]
@@ -278,7 +278,8 @@ def run_chunks(
         work()
     finally:
         begun = [helper for helper in helpers if not helper.cancel()]
-        wait(begun)
+        for helper in begun:
+            helper.exception()  # waits for its end; `wait` takes as long as a short kernel
     for helper in begun:
         helper.result()
 
