@@ -1,8 +1,9 @@
 """Rules of the house that a machine can check, as a script: ``python tests/style.py`` names what breaks them.
 
-Rules for the packages: who imports whom, and kernels that say what they write. The house is shown
-in `docs/contribute.md`; `MAY_IMPORT` is its table of arrows. Rules for the tests: they use public names, and each of
-them checks something. A rule for words: a sentence points back at most once. ``ruff`` has the other rules of style.
+Rules for the packages: who imports whom, kernels that say what they write, and no forms of loops outside of them. The
+house is shown in `docs/contribute.md`; `MAY_IMPORT` is its table of arrows. Rules for the tests: they use public
+names, and each of them checks something. A rule for words: a sentence points back at most once. ``ruff`` has the other
+rules of style.
 """
 
 import ast
@@ -309,6 +310,13 @@ def kernel_arguments():
                 yield path, f"{kernel.name} writes {wrong}, whose names do not end in _out"
 
 
+def loops():
+    """Only kernels' host functions ask for the form of the loops."""
+    for path in PACKAGE_FILES:
+        if "device().form" in path.read_text("utf-8"):
+            yield path, "asks for device().form: let a host function of lfpiv_kernels answer"
+
+
 def tests():
     """Tests use public names, and each of them checks something."""
     support = checking_helpers([tree_of(path) for path in FILES if path not in TEST_FILES])
@@ -365,7 +373,7 @@ def page_texts(path):
     yield re.sub(r"^```.*?^```\s*$|\$\$.*?\$\$", "\n\n", path.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
-RULES = (imports, circles, taichi, kernel_arguments, tests, sentences)
+RULES = (imports, circles, taichi, kernel_arguments, loops, tests, sentences)
 
 
 def broken():

@@ -89,6 +89,73 @@ def _traced(model, p, q, r, u, v):
     return st
 
 
+@ti.func
+def _model_of(models: ti.template(), v):
+    """Return the ray model of a voxel."""
+    own = ti.Vector.zero(ti.f32, MODEL_SIZE)
+    for k in range(MODEL_SIZE):
+        own[k] = models[v, k]
+    return own
+
+
+@ti.func
+def _shift_of(voxel):
+    """Return the digital shift of a voxel's points."""
+    shift = ti.Vector.zero(ti.i32, DIMENSIONS)
+    for k in ti.static(range(DIMENSIONS)):
+        shift[k] = _hashed(voxel * DIMENSIONS + k)
+    return shift
+
+
+@ti.func
+def _shifted_point(points: ti.template(), n, shift: ti.template()):
+    """Return a shifted point of the cube [-1/2, 1/2]^5."""
+    at = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
+    for k in ti.static(range(DIMENSIONS)):
+        at[k] = _unit(points[k, n] ^ shift[k]) - 0.5
+    return at
+
+
+@ti.func
+def _taken(lit: ti.template(), lane, mark, edge):
+    """Clear the marks of a tile; return its lit columns, a bit each, its first lit row and its last one."""
+    columns, low, high = 0, edge, -1
+    for row in range(edge):
+        bits = lit[lane, mark + row]
+        if bits != 0:
+            lit[lane, mark + row] = 0
+            columns |= bits
+            low, high = ti.min(low, row), row
+    return ti.Vector([columns, low, high])
+
+
+@ti.func
+def _ends(bits):
+    """Return the places of the lowest and the highest bit that is set."""
+    left, right = 0, BLOCK_WIDTH - 1
+    while (bits >> left) & 1 == 0:
+        left += 1
+    while (bits >> right) & 1 == 0:
+        right -= 1
+    return ti.Vector([left, right])
+
+
+@ti.func
+def _take_counts(window: ti.template(), lane, start, edge, size: ti.template(), most, out: ti.template(), at):
+    """Clear the counts of a block of a size (width, height); write their levels to `out` at (voxel, place).
+
+    A negative place writes none.
+    """
+    for row in range(size[1]):
+        for column in range(size[0]):
+            place = start + row * edge + column
+            count = window[lane, place]
+            window[lane, place] = 0
+            if at[1] >= 0:
+                level = (2 * TOP * count + most) // (2 * most)  # rounded, exactly
+                out[at[0], at[1] + size[0] * row + column] = ti.cast(level, ti.u8)
+
+
 @functools.cache
 def sobol_points(rays):
     """Return the first points of Sobol's sequence in fixed point, shape (DIMENSIONS, rays), int32."""
@@ -138,21 +205,14 @@ def _kernel(hexagonal, block, batch, share):
             voxels = model.shape[0]
             for turn in range((voxels - lane + lanes - 1) // lanes):
                 v = lane + turn * lanes
-                own = ti.Vector.zero(ti.f32, MODEL_SIZE)
-                for k in range(MODEL_SIZE):
-                    own[k] = model[v, k]
-                shift = ti.Vector.zero(ti.i32, DIMENSIONS)
-                for k in ti.static(range(DIMENSIONS)):
-                    shift[k] = _hashed((first_voxel + v) * DIMENSIONS + k)
+                own, shift = _model_of(model, v), _shift_of(first_voxel + v)
                 most = 0
                 lens_i, lens_j = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
                 at_x, at_y = ti.Vector.zero(ti.i32, batch), ti.Vector.zero(ti.i32, batch)
                 for b in range(point.shape[1] // batch):
                     for c in range(batch):
                         n = b * batch + c
-                        at = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
-                        for k in ti.static(range(DIMENSIONS)):
-                            at[k] = _unit(point[k, n] ^ shift[k]) - 0.5
+                        at = _shifted_point(point, n, shift)
                         pupil = _on_disc(2.0 * at[3], 2.0 * at[4])
                         st = _traced(own, at[0], at[1], at[2], pupil[0] * camera[4], pupil[1] * camera[4])
                         lens = nearest_lens(lattice, st[0], st[1], hexagonal)
@@ -164,62 +224,45 @@ def _kernel(hexagonal, block, batch, share):
                     for c in range(batch):
                         i, j = lens_i[c] - array[0], lens_j[c] - array[1]
                         own_i, own_j = lens_i[c] - first_lens[v, 0], lens_j[c] - first_lens[v, 1]
+                        column, row = -1, -1
                         if 0 <= own_i < box[0] and 0 <= own_j < box[1] and 0 <= i < lenses and 0 <= j < rows_of_lenses:
                             column, row = at_x[c] - corner[j, i, 0], at_y[c] - corner[j, i, 1]
-                            if (
-                                0 <= at_x[c] < columns_of_sensor
-                                and 0 <= at_y[c] < rows_of_sensor
-                                and 0 <= column < edge
-                                and 0 <= row < edge
-                            ):
-                                slot = own_j * box[0] + own_i
-                                place = (slot * edge + row) * edge + column
-                                count = window_out[lane, place] + 1
-                                window_out[lane, place] = count
-                                most = ti.max(most, count)
-                                tile = column // BLOCK_WIDTH
-                                mark = (slot * tiles + tile) * edge + row
-                                lit_out[lane, mark] = lit_out[lane, mark] | (1 << (column - BLOCK_WIDTH * tile))
+                        if (
+                            0 <= at_x[c] < columns_of_sensor
+                            and 0 <= at_y[c] < rows_of_sensor
+                            and 0 <= column < edge
+                            and 0 <= row < edge
+                        ):
+                            slot = own_j * box[0] + own_i
+                            place = (slot * edge + row) * edge + column
+                            count = window_out[lane, place] + 1
+                            window_out[lane, place] = count
+                            most = ti.max(most, count)
+                            tile = column // BLOCK_WIDTH
+                            mark = (slot * tiles + tile) * edge + row
+                            lit_out[lane, mark] = lit_out[lane, mark] | (1 << (column - BLOCK_WIDTH * tile))
                 # the lit part of each tile of columns under a lens is a block; blocks of even lenses come first
                 blocks, values, even_blocks, even_values = 0, 0, 0, 0
-                for parity in range(2):
-                    for slot in range(box[0] * box[1]):
-                        i = first_lens[v, 0] + slot % box[0]
-                        j = first_lens[v, 1] + slot // box[0]
-                        if (i - array[0] + j - array[1]) & 1 == parity:
-                            for tile in range(tiles):
-                                mark = (slot * tiles + tile) * edge
-                                columns, low, high = 0, edge, -1
-                                for row in range(edge):
-                                    bits = lit_out[lane, mark + row]
-                                    if bits != 0:
-                                        lit_out[lane, mark + row] = 0
-                                        columns |= bits
-                                        low, high = ti.min(low, row), row
-                                if columns != 0:
-                                    left, right = 0, BLOCK_WIDTH - 1
-                                    while (columns >> left) & 1 == 0:
-                                        left += 1
-                                    while (columns >> right) & 1 == 0:
-                                        right -= 1
-                                    width, height = right - left + 1, high - low + 1
-                                    fits = blocks < ray_out.shape[1] and values + width * height <= value_out.shape[1]
-                                    if fits:
-                                        first = ((j - array[1]) * LAYERS + 1) * lenses + i - array[0]
-                                        ray_out[v, blocks] = (first * edge + low) * edge + tile * BLOCK_WIDTH + left
-                                        extent_out[v, blocks] = width + 256 * height
-                                    for row in range(height):
-                                        start = (slot * edge + low + row) * edge + tile * BLOCK_WIDTH + left
-                                        for column in range(width):
-                                            count = window_out[lane, start + column]
-                                            window_out[lane, start + column] = 0
-                                            if fits:
-                                                level = (2 * TOP * count + most) // (2 * most)  # rounded, exactly
-                                                value_out[v, values + width * row + column] = ti.cast(level, ti.u8)
-                                    blocks += 1
-                                    values += width * height
-                    if parity == 0:
-                        even_blocks, even_values = blocks, values
+                for number in range(2 * box[0] * box[1]):
+                    parity, slot = number // (box[0] * box[1]), number % (box[0] * box[1])
+                    i, j = first_lens[v, 0] + slot % box[0] - array[0], first_lens[v, 1] + slot // box[0] - array[1]
+                    if (i + j) & 1 == parity:
+                        for tile in range(tiles):
+                            lit = _taken(lit_out, lane, (slot * tiles + tile) * edge, edge)
+                            if lit[0] != 0:
+                                ends, low = _ends(lit[0]), lit[1]
+                                size = ti.Vector([ends[1] - ends[0] + 1, lit[2] - low + 1])
+                                left, area = tile * BLOCK_WIDTH + ends[0], size[0] * size[1]
+                                at = ti.Vector([v, -1])
+                                if blocks < ray_out.shape[1] and values + area <= value_out.shape[1]:
+                                    first = (j * LAYERS + 1) * lenses + i
+                                    ray_out[v, blocks] = (first * edge + low) * edge + left
+                                    extent_out[v, blocks] = size[0] + 256 * size[1]
+                                    at[1] = values
+                                start = (slot * edge + low) * edge + left
+                                _take_counts(window_out, lane, start, edge, size, most, value_out, at)
+                                blocks, values = blocks + 1, values + area
+                                even_blocks, even_values = even_blocks + 1 - parity, even_values + (1 - parity) * area
                 needed_out[v, 0], needed_out[v, 1] = blocks, values
                 needed_out[v, 2], needed_out[v, 3] = even_blocks, even_values
                 needed_out[v, 4] = most

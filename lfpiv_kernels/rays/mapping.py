@@ -76,6 +76,41 @@ def _layer_starts(sizes):
     return first
 
 
+def _width(sizes):
+    """Return the number of nodes that are stored: those of the last hidden layer are added to the outputs at once."""
+    return max(sizes[:-2])
+
+
+@ti.func
+def _feed(value: ti.template(), held: ti.template(), layers: ti.template(), sizes: ti.template(), batch: ti.template()):
+    """Feed the scaled inputs in `held` through the layers; add the last hidden layer's nodes to the outputs `value`."""
+    first, hidden_layers, outputs = ti.static(_layer_starts(sizes), len(sizes) - 2, sizes[-1])
+    width = ti.static(_width(sizes))
+    for k in ti.static(range(hidden_layers)):
+        fed = ti.static((k % 2) * width)
+        for j in range(sizes[k + 1]):
+            row = first[k] + (sizes[k] + 1) * j
+            total = ti.Vector.zero(ti.f32, batch)
+            for c in range(batch):
+                total[c] = layers[row + sizes[k]]
+            if ti.static(k == 0):
+                for c in range(batch):
+                    for i in ti.static(range(sizes[0])):
+                        total[c] += layers[row + i] * held[i, c]
+            else:
+                for i in range(sizes[k]):
+                    for c in range(batch):
+                        total[c] += layers[row + i] * held[fed + i, c]
+            if ti.static(k < hidden_layers - 1):
+                for c in range(batch):
+                    held[width - fed + j, c] = _tanh(total[c])
+            else:
+                for c in range(batch):
+                    node = _tanh(total[c])
+                    for o in ti.static(range(outputs)):
+                        value[o, c] += layers[first[hidden_layers] + (sizes[-2] + 1) * o + j] * node
+
+
 @functools.cache
 def _kernel(sizes, batch, fan, has_lens):
     """Return the kernel of one architecture: `sizes` are inputs, nodes of each hidden layer, outputs.
@@ -85,7 +120,6 @@ def _kernel(sizes, batch, fan, has_lens):
     """
     inputs, outputs, hidden_layers = sizes[0], sizes[-1], len(sizes) - 2
     first = _layer_starts(sizes)
-    width = max(sizes[:-2])  # nodes that are stored; those of the last hidden layer are added to the outputs at once
 
     @ti.kernel
     def _evaluate(
@@ -101,7 +135,7 @@ def _kernel(sizes, batch, fan, has_lens):
         rays = values_out.shape[0]
         for b in range((rays + batch - 1) // batch):
             raw = ti.Matrix.zero(ti.f32, inputs, batch)
-            held = ti.Matrix.zero(ti.f32, 2 * width, batch)  # inputs and outputs of a layer in turn
+            held = ti.Matrix.zero(ti.f32, 2 * _width(sizes), batch)  # inputs and outputs of a layer in turn
             value = ti.Matrix.zero(ti.f32, outputs, batch)
             for c in range(batch):
                 ray = ti.min(b * batch + c, rays - 1)
@@ -111,29 +145,7 @@ def _kernel(sizes, batch, fan, has_lens):
                     held[i, c] = (raw[i, c] - scaling[0, i]) * scaling[1, i]
                 for o in ti.static(range(outputs)):
                     value[o, c] = layers[first[hidden_layers] + (sizes[-2] + 1) * o + sizes[-2]]
-            for k in ti.static(range(hidden_layers)):
-                fed = ti.static((k % 2) * width)
-                for j in range(sizes[k + 1]):
-                    row = first[k] + (sizes[k] + 1) * j
-                    total = ti.Vector.zero(ti.f32, batch)
-                    for c in range(batch):
-                        total[c] = layers[row + sizes[k]]
-                    if ti.static(k == 0):
-                        for c in range(batch):
-                            for i in ti.static(range(inputs)):
-                                total[c] += layers[row + i] * held[i, c]
-                    else:
-                        for i in range(sizes[k]):
-                            for c in range(batch):
-                                total[c] += layers[row + i] * held[fed + i, c]
-                    if ti.static(k < hidden_layers - 1):
-                        for c in range(batch):
-                            held[width - fed + j, c] = _tanh(total[c])
-                    else:
-                        for c in range(batch):
-                            node = _tanh(total[c])
-                            for o in ti.static(range(outputs)):
-                                value[o, c] += layers[first[hidden_layers] + (sizes[-2] + 1) * o + j] * node
+            _feed(value, held, layers, sizes, batch)
             for c in range(batch):
                 ray = b * batch + c
                 if ray < rays:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from lfpiv_kernels import native
+from lfpiv_kernels import native, runtime
 from lfpiv_kernels.launch import Call, launch, load
 from lfpiv_kernels.reconstruction.weight_blocks import BlockRows, Blocks
 from lfpiv_kernels.transfer import bytes_on_device, to_device
@@ -110,6 +110,11 @@ def _project(
     intensity = volume[voxel] * rows.scale[voxel]
     if intensity != 0.0:
         _scatter(rows, voxel, ray_set, intensity, rays_out)
+
+
+def have_loops() -> bool:
+    """Return whether the running device has loops over rows; a GPU has none."""
+    return runtime.device().form == "cpu"
 
 
 def with_rows(blocks: Blocks, sets: int) -> Blocks:

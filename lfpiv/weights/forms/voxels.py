@@ -23,8 +23,7 @@ from lfpiv.weights.counting import CountedVoxels
 from lfpiv.weights.forms import shared_profiles
 from lfpiv.weights.forms.form import Form
 from lfpiv.weights.memory_left import MemoryLeft, rays_bytes
-from lfpiv_kernels import runtime
-from lfpiv_kernels.reconstruction.block_rows import ROW_BYTES, with_rows
+from lfpiv_kernels.reconstruction.block_rows import ROW_BYTES, have_loops, with_rows
 from lfpiv_kernels.reconstruction.projector import Projector
 from lfpiv_kernels.reconstruction.projector_gpu import MOST_BYTES, device_bytes
 from lfpiv_kernels.reconstruction.ray_projector import RayProjector
@@ -68,7 +67,7 @@ class Voxels(Form):
         rig, sets = self.rig, shared_profiles.ray_sets(self.rig.cameras)
         several = len(rig.cameras) > 1
         many = rig.stored.size >= shared_profiles.FEWEST_VOXELS and sets >= shared_profiles.FEWEST_SETS
-        if not (rig.shared and not rig.rays and several and many and runtime.device().form == "cpu"):
+        if not (rig.shared and not rig.rays and several and many and have_loops()):
             return 1
         if max(self._sampled_rows(name) * self._places(name).size for name in self.suits) > MOST_BLOCKS:
             return 1
