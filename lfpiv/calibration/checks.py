@@ -66,12 +66,6 @@ REJECTED = 0.5
 """Part of a plane's dots that is rejected above which a warning is due."""
 STEEPEST_DEG = 4.0
 """Largest tilt of a plane of the board against the others [degree]: ten times what a stage does."""
-APART = 10.0
-"""Difference of the defocus of two planes that shows their order [scatter over the dots of a plane]."""
-FEWEST_ORDERED = 3
-"""Least number of planes that have an order; that of two is reversed, which is told elsewhere."""
-FEWEST_DOTS = 6
-"""Number of dots of a plane up to which its defocus is not looked at."""
 OFF_PITCHES = 1.0
 """Distance of a plane's dots from where they are stated to be above which a warning is due [microlens pitch]."""
 ROUNDING = 0.4
@@ -226,45 +220,6 @@ def check_light(experiment: Experiment, setup: CameraSetup, images: Sequence[np.
         warn(log, Warning(code=Code.BOARD_SATURATED, subject=setup.name, figures=figures))
     plane = len(images) // 2
     _check_tones(f"{setup.name}, plane {plane}", images[plane])
-
-
-def check_focus(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:
-    """Refuse board images whose dots come into focus in another order than that of the stated planes.
-
-    Images of two planes that are exchanged may look alike but for a column of dots, so that labels fit. The slope of a
-    dot's rays over the pupil shows its depth without knowing which dot it is. In the middle of the field it grows, or
-    falls, from plane to plane. The reverse of the whole order is named elsewhere.
-
-    Raises
-    ------
-    InputError
-        Names the planes and their files.
-    """
-    plane = dots.measured_dot // (experiment.board.dots[0] * experiment.board.dots[1])
-    defocus = np.trace(dots.slope, axis1=1, axis2=2) / 2
-    shown, focus, scatter = [], [], []
-    for number in np.unique(plane):
-        here = plane == number
-        if np.count_nonzero(here) > FEWEST_DOTS:
-            field = np.column_stack([np.ones(np.count_nonzero(here)), dots.chief_mm[here]])
-            fitted = np.linalg.lstsq(field, defocus[here])[0]
-            shown.append(int(number))
-            focus.append(float(fitted[0]))
-            scatter.append(float(np.std(defocus[here] - field @ fitted)))
-    if len(shown) < FEWEST_ORDERED:
-        return
-    stated = np.argsort(np.asarray(experiment.board.planes_mm)[shown])
-    steps = np.subtract.outer(focus, focus).T[np.ix_(stated, stated)][np.triu_indices(len(shown), 1)]
-    growing, falling = (np.count_nonzero(sign * steps > APART * np.median(scatter)) for sign in (1, -1))
-    if min(growing, falling) == 0:
-        return
-    seen = np.argsort(np.multiply(focus, 1 if growing > falling else -1))
-    displaced = sorted(shown[number] for number in stated[stated != seen])
-    files = ", ".join(str(experiment.board_path(setup.name, number)) for number in displaced)
-    raise InputError(
-        f"{files}: board.images of camera {setup.name!r}: expected dots that come into focus in the order of "
-        f"board.planes_mm, found planes {', '.join(map(str, displaced))} in another order. Are their images exchanged?"
-    )
 
 
 def check_planes(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:

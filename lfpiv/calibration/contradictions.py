@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lfpiv.calibration import plane_focus
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import ALIKE_DEG, RIGHT, Mistake, likely_mistake, mistakes, turn_deg
 from lfpiv.calibration.board.planes import Signals, board_images
@@ -28,7 +29,7 @@ log = logging.getLogger(__name__)
 
 COMPLETE = 0.9
 """Part of the expected dots that a complete board shows."""
-STRETCHES = (0.1, 0.5, 2.0, 10.0, 1 / 25.4, 25.4)
+STRETCHES = (0.0254, 1 / 25.4, 0.1, 0.5, 2.0, 10.0, 25.4)
 """Depths of the planes over the stated ones, if these are in another unit, or are half or twice the distances."""
 WIDER, NARROWER = 1.25, 0.6
 """Aperture over the stated one if planes are twice or half as far apart: 1.40 and 0.42 were found, water shows 0.75."""
@@ -169,6 +170,10 @@ def cause(experiment: Experiment, decoder_of: Decoders, dots_of: Dots, stretches
         tried = [*mistakes(setup.orientation, board.planes_mm), *(Mistake(stretch=one) for one in STRETCHES)]
         wet = partial(mistake_in_liquid, partial(dots_of, setup, decoder), tried, setup.orientation, decoder.optics)
         mistake = likely_mistake(signals, decoder, board, setup.orientation, stretches=stretches, in_liquid=wet)
+        if mistake is not None and mistake.planes:  # two planes in each other's place resemble the reverse order
+            views = [dots for one in (RIGHT, mistake) if (dots := dots_of(setup, decoder, one)) is not None]
+            if views and (text := plane_focus.mistaken_depths(experiment, setup, *views)):
+                return text
         if mistake is not None and mistake != RIGHT:
             found[setup.name] = mistake
     sentences = [_exchanged(experiment, found, decoders) or _mirrors(experiment, found), _planes(experiment, found)]

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lfpiv.calibration import checks, contradictions
+from lfpiv.calibration import checks, contradictions, plane_focus
 from lfpiv.calibration.board.board import measure_board
 from lfpiv.calibration.board.dots import BoardDots, DotBoard
 from lfpiv.calibration.board.hypotheses import RIGHT, Mistake
@@ -136,13 +136,18 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
 
     try:
         dots = known = _measure_dots(experiment, setup, sensor.decoder, images)
-        lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     except InputError as error:
         raise InputError(cause(None) or str(error)) from None
+    plane_focus.check_depths(experiment, setup, dots)
+    try:
+        lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
+    except InputError as error:
+        order = plane_focus.reversed_order(experiment, setup, dots)
+        raise InputError(cause(None) or order or str(error)) from None
     surface = liquid_surface(dots, lens, setup.optics)
     if contradictions.doubtful(setup, dots, lens, surface) and (text := cause(lens)):
         raise InputError(text)
-    checks.check_focus(experiment, setup, dots)
+    plane_focus.check_order(experiment, setup, dots)
     step(1.0)
     return Measured(sensor=sensor, dots=dots, lens=lens, surface=surface)
 

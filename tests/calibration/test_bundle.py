@@ -173,6 +173,16 @@ def test_one_plane_far_off_leaves_the_others_where_they_are():
     assert "plane 2 of the board stands at z = -0.180 mm, not at -0.3 mm" in warning.sentence
 
 
+@pytest.mark.parametrize("wrong", range(4))
+def test_one_of_four_planes_off_leaves_the_others_where_they_are(wrong):
+    """Three planes outvote it. The others were moved by up to half of its error, with the depth of all vectors."""
+    board = DotBoard(dots=(6, 6), spacing_mm=0.8, diameter_mm=0.1, planes_mm=(-0.8, -0.2, 0.4, 0.9))
+    plane = np.zeros((4, 6))
+    plane[wrong, 2] = 0.15
+    found = fitted(true_points(plane, np.zeros((board.size, 2)), board), ANGLES["two cameras"], board=board)
+    assert np.abs(found.plane[:, :3] - plane[:, :3]).max() < 4e-3
+
+
 def test_a_plane_that_no_stage_tilts_is_refused():
     """Rays bent at the surface of a liquid, which one camera cannot tell from a tilt, left 0.6 pitch unseen."""
     plane, dots = errors_of(np.random.default_rng(0))

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.errors import COMPONENTS, KINDS
+from lfpiv.lightfield.decoder import NORMAL_MAD
 
 LEAST_PLANES = 3
 """Least number of planes. Two planes show no error that a sheared world does not show."""
-GAUGE_ROUNDS = 6
-"""Rounds of weights that choose the world in which most planes stand where they are stated to be."""
+OFF = 2.5
+"""A plane has no part in the choice of the world if it is farther off than this in the world of the majority [robust
+standard deviation of its planes]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,20 +63,20 @@ class Effects:
     def as_most_planes(self, values: np.ndarray, depth: np.ndarray) -> Effects:
         """Return the unknowns with the moved world chosen in which most planes stand where they are stated to be.
 
-        Least squares would move the world towards a single plane that is far off.
+        Least squares would move the world towards a single plane that is far off. So planes that are off in the world
+        of the majority are left out of them ([1]_).
+
+        References
+        ----------
+        .. [1] P. J. Rousseeuw and A. M. Leroy, "Robust Regression and Outlier Detection", Wiley (1987), chapter 5.
         """
         plane = self.plane.copy()
         used = self.used_planes
         for component in range(6):
             line = np.stack([np.ones(used.sum()), depth[used]], axis=1)[:, : 2 if component < 3 else 1]
             basis = self.plane[used, component]
-            error = rest = basis @ values
-            share = np.zeros((line.shape[1], len(error)))
-            for _ in range(GAUGE_ROUNDS):
-                typical = max(float(np.median(np.abs(rest))), np.finfo(float).tiny)
-                weighted = line / np.maximum(np.abs(rest) / typical, 1)[:, None]
-                share = np.linalg.solve(weighted.T @ line, weighted.T)
-                rest = error - line @ (share @ error)
+            weighted = line * _agreeing(line, basis @ values)[:, None]
+            share = np.linalg.solve(weighted.T @ line, weighted.T)
             plane[used, component] = basis - line @ (share @ basis)
         return replace(self, plane=plane)
 
@@ -88,6 +91,22 @@ class Effects:
         moved[:, 1] += error[:, 5] * x
         moved[:, 2] += error[:, 3] * y - error[:, 4] * x
         return moved
+
+
+def _agreeing(line: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return which planes stand where they are stated to be, in the world in which most of them do so best, bool.
+
+    Through as few planes as determine a world, all worlds are tried. With three planes none of them is the majority,
+    and all count.
+    """
+    planes, terms = line.shape
+    some = np.array(list(combinations(range(planes), terms)))
+    worlds = np.linalg.solve(line[some], error[some][..., None])[..., 0]
+    rest = np.abs(error - worlds @ line.T)
+    typical = np.partition(rest, (planes + terms - 1) // 2, axis=1)[:, (planes + terms - 1) // 2]
+    best = int(typical.argmin())
+    scatter = NORMAL_MAD * (1 + 5 / (planes - terms)) * typical[best]
+    return np.asarray(rest[best] <= max(OFF * scatter, np.finfo(float).tiny))
 
 
 def _complement(columns: np.ndarray) -> np.ndarray:
