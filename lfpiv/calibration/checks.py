@@ -20,6 +20,7 @@ from lfpiv.calibration.board.errors import BoardErrors
 from lfpiv.calibration.board.pupil_zones import worst
 from lfpiv.calibration.liquid import LiquidSurface
 from lfpiv.calibration.network import Network
+from lfpiv.calibration.plane_focus import mistaken_depths
 from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
@@ -150,6 +151,8 @@ def check_pupil(
     found, expected = dots.found.sum(), dots.expected.sum()
     limit = PUPIL_SCALE if found >= COMPLETE * expected else PUPIL_SCALE_INCOMPLETE
     if not abs(fitted.pupil_scale - 1) <= limit:
+        if text := mistaken_depths(experiment, setup, dots):
+            raise InputError(text)
         raise InputError(
             f"{experiment.path}: camera {setup.name!r}: the stated rig contradicts the board images. {found} of "
             f"{expected} dots were found, and their blur at each depth is that of an aperture {fitted.pupil_scale:.2f} "

@@ -142,8 +142,9 @@ def _measure_camera(experiment: Experiment, setup: CameraSetup, step: StepProgre
     try:
         lens = fit_lens(experiment, setup, dots, sensor.lattice.pitch_mm)
     except InputError as error:
-        order = plane_focus.reversed_order(experiment, setup, dots)
-        raise InputError(cause(None) or order or str(error)) from None
+        shown = cause(None) or plane_focus.mistaken_depths(experiment, setup, dots)
+        shown = shown or plane_focus.reversed_order(experiment, setup, dots)
+        raise InputError(shown or str(error)) from None
     surface = liquid_surface(dots, lens, setup.optics)
     if contradictions.doubtful(setup, dots, lens, surface) and (text := cause(lens)):
         raise InputError(text)

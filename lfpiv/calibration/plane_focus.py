@@ -26,9 +26,9 @@ FITS = 0.25
 """Depths fit the focus of the planes if they differ by less, root mean square [median distance of planes]."""
 CLEARLY = 0.5
 """Largest misfit of the depths with a mistake put right, relative to the depths as stated."""
-NARROWEST, WIDEST = 0.6, 1.4
+NARROWEST, WIDEST = 0.4, 1.4
 """Distance of planes by their focus over the stated one, where optics and medium differ from what is stated: water has
-0.75."""
+0.75, and 0.57 at an angle."""
 UNITS = (0.001, 0.0254, 10.0, 25.4, 1000.0)
 """Millimetres of a micrometre, a thousandth of an inch, a centimetre, an inch and a metre."""
 SAME_UNIT = 1.2
@@ -87,24 +87,31 @@ class PlaneFocus:
 
 
 def check_depths(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:
-    """Refuse planes whose focus shows a certain mistake; see `mistaken_depths`.
+    """Refuse planes in each other's place, and depths in another unit, as the focus shows them.
+
+    A single plane elsewhere is none of that: its dots do not fit the others and are left out with a warning.
 
     Raises
     ------
     InputError
         Names the planes and their files.
     """
-    if text := mistaken_depths(experiment, setup, dots):
+    if text := mistaken_depths(experiment, setup, dots, single=False):
         raise InputError(text)
 
 
 def mistaken_depths(
-    experiment: Experiment, setup: CameraSetup, dots: BoardDots, otherwise: BoardDots | None = None
+    experiment: Experiment,
+    setup: CameraSetup,
+    dots: BoardDots,
+    otherwise: BoardDots | None = None,
+    *,
+    single: bool = True,
 ) -> str | None:
     """Name two planes in each other's place, one elsewhere, or another unit, as a message; None if none is certain.
 
     The reverse of the whole order is named elsewhere. A camera without an orientation is not judged. `otherwise` are
-    dots that were looked for at other depths.
+    dots that were looked for at other depths. `single` says whether one plane elsewhere is named.
     """
     dots_per_plane = experiment.board.dots[0] * experiment.board.dots[1]
     focus = PlaneFocus.of(dots, dots_per_plane)
@@ -125,7 +132,7 @@ def mistaken_depths(
                 f"far apart as stated. Check the unit, which is the millimetre; planes_mm = [{depths}] would fit."
             )
     found = min(_mistakes(stated, seen), key=lambda one: one.misfit)
-    if not found.misfit < min(FITS, CLEARLY * before):
+    if not found.misfit < min(FITS, CLEARLY * before) or (len(found.planes) == 1 and not single):
         return None
     files = ", ".join(str(experiment.board_path(setup.name, int(focus.number[place]))) for place in found.planes)
     text = found.text(focus.number, experiment.board.planes_mm)
@@ -168,6 +175,8 @@ def check_order(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> 
     growing, falling = (np.count_nonzero(sign * steps > APART * focus.scatter) for sign in (1, -1))
     if min(growing, falling) == 0:
         return
+    if text := mistaken_depths(experiment, setup, dots):
+        raise InputError(text)
     seen = np.argsort(defocus if growing > falling else -defocus)
     displaced = sorted(map(int, shown[stated[stated != seen]]))
     files = ", ".join(str(experiment.board_path(setup.name, number)) for number in displaced)

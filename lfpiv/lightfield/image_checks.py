@@ -37,6 +37,9 @@ HELD = 0.6
 """Least share of a bright pixel's light that a frame which holds both exposures keeps, relative to the pulses."""
 ALIKE = 0.3
 """Largest share that is kept the other way round, relative to it: particles that hardly move are kept either way."""
+SAME = 0.9
+"""Least share of bright pixels with the same counts in two images of one exposure. In two exposures of particles at
+rest noise of 0.3 counts leaves 0.7, noise of a count 0.3."""
 
 _BAND_ROWS = 512  # rows evaluated, in the middle of the sensor
 _MEAN_REACH_PITCHES = 3.0  # half width of the local mean that is subtracted: ambient light, reflections
@@ -55,6 +58,7 @@ _MODEL_ERROR = 0.01  # of the profile of a blurred disc, relative to its core, r
 _CLEAR_PX, _CLEAR_WITHOUT_DARK_PX = 0.5, 2.0  # width of the gap beyond a microimage's edge
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
 _BRIGHT_SAMPLES, _BRIGHT = 1_000_000, 0.995  # pixels that are compared, part of them that is dimmer than the rest
+_SAME_COUNTS = 0.01  # largest difference of the same counts above backgrounds that are measured one by one
 _DIMMER = 0.5  # level from which pixels of the weaker pulse count, relative to the brightest ones
 _LOST, _LOST_BACK = (
     0.01,
@@ -383,6 +387,28 @@ def require_different(images: Iterable[tuple[str, bytes]]) -> None:
                 f"{where}: expected an image of its own, found the same image as {other}. Check particles.images, and "
                 "what was copied."
             )
+
+
+def same_light(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two images show one exposure: but for some pixels bright ones have the same counts in both.
+
+    Clipped pixels do not count. A constant may be added, such as a background. Of images that were compressed with
+    losses, or converted to fewer bits, counts differ.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (rows, columns)
+        Images [counts].
+    """
+    one, other = (image.ravel()[:: 1 + image.size // _BRIGHT_SAMPLES] for image in (first, second))
+    if one.shape != other.shape:
+        return False
+    lit = (one < one.max()) & (other < other.max())
+    if not lit.any():
+        return False
+    bright = lit & (one >= np.quantile(one[lit], _BRIGHT))
+    change = other[bright].astype(float) - one[bright]
+    return float(np.mean(np.abs(change - np.median(change)) < _SAME_COUNTS)) >= SAME
 
 
 def fingerprint(image: np.ndarray) -> bytes:

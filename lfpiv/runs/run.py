@@ -40,6 +40,7 @@ from lfpiv.runs.pair import PairWork
 from lfpiv.runs.pair_outcome import Outcome
 from lfpiv.runs.pending_pairs import PendingPairs
 from lfpiv.runs.refinement import Refinement
+from lfpiv.runs.repeated_images import repeated_images
 from lfpiv.runs.reversed_pairs import reversed_pairs, still
 from lfpiv.runs.summary import Contents, EarlierSummary
 from lfpiv.warn import Gathering, Warning, collected, warn
@@ -334,6 +335,7 @@ class Run:
             if pair not in self.finished and (frames := found.fitting_volumes()) is not None:
                 volumes.add(warning.of_pair(pair) for frame in frames for warning in frame.warnings)
         light, warnings = provenance.background_figures(self.folder.background)
+        copies = self.finished.copies()
         return Contents(
             vectors=self.finished,
             selected=self.numbers,
@@ -343,7 +345,7 @@ class Run:
             guard=self.guard,
             damping=bootstrap.stored(self.experiment, self.folder, self.damping_stamp),
             refinement=self.refinement,
-            copies=self.finished.copies(),
+            copies={**repeated_images(self.finished, self.experiment, copies), **copies},
         )
 
     def _tracks(self) -> dict[str, Any] | None:

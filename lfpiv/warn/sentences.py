@@ -123,8 +123,8 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.STANDING: "light stands still at {place}; it is {share:percent} % of an image's light: {remedy}",
     Code.COPIED: (
-        "an image is a copy, byte by byte, of an image of {noun} {first:.0f}, so the same light counts twice. Check "
-        "particles.images, and what was copied"
+        "an image has the same pixels, all or nearly all, as an image of {noun} {first:.0f}, so the same light counts "
+        "twice. Check particles.images, and what was copied"
     ),
     Code.DARK_PART: (
         "rows {top} to {bottom}, columns {left} to {right} show no particles where {others} would have them, although "

@@ -300,6 +300,13 @@ def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(r
     assert camera.report.sigma_nor_stated > 10 * camera.report.sigma_nor_test  # the stage's part and the lens's
 
 
+def test_planes_whose_images_are_exchanged_are_named(rig, tmp_path):
+    experiment, _, _ = rig
+    one, other = (experiment.board_image("only", plane).astype(np.uint16) for plane in (1, 2))
+    with pytest.raises(lfpiv.InputError, match=r"plane_02\.tif.*planes 1 and 2 come into focus in each other's place"):
+        lfpiv.calibrate(spoiled(experiment, tmp_path / "data", {1: other, 2: one}))
+
+
 def test_an_angle_in_radians_is_shown_beside_the_fitted_one(rig):
     experiment, _, calibration = rig
     setup = dataclasses.replace(experiment.cameras[0], orientation=Orientation(np.radians(-30.0)))

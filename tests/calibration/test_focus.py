@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from lfpiv import InputError
-from lfpiv.calibration.plane_focus import check_depths, check_order, reversed_order
+from lfpiv.calibration.plane_focus import check_depths, check_order, mistaken_depths, reversed_order
 from lfpiv.geometry.orientation import Orientation
 
 DEPTHS = [-0.8, -0.4, 0.0, 0.4, 0.8]
-SETUP = SimpleNamespace(name="left")
+SETUP = SimpleNamespace(name="left", orientation=None)
 OBJECT_MM, MAGNIFICATION = 140.0, 0.75
 
 
@@ -86,20 +86,18 @@ def setup(angle_deg):
 
 def said(shown_mm, planes_mm, angle_deg=40.0, **how):
     experiment, dots = rig(shown_mm, planes_mm, angle_deg=angle_deg, **how)
-    with pytest.raises(InputError) as caught:
-        check_depths(experiment, setup(angle_deg), dots)
-    return str(caught.value)
+    return mistaken_depths(experiment, setup(angle_deg), dots)
 
 
 @pytest.mark.parametrize("angle_deg", [-65.0, -30.0, 0.0, 50.0, 150.0])
 @pytest.mark.parametrize("planes_mm", [UNEVEN, (-0.7, 0.0, 0.7), DEPTHS[::-1], (0.4, -0.4, 0.8, 0.0, -0.8)], ids=str)
-@pytest.mark.parametrize("scale", [1 / 1.33, 1.0, 1.1])
+@pytest.mark.parametrize("scale", [0.5, 1 / 1.33, 1.0, 1.1])
 def test_planes_where_they_are_stated_are_not_doubted_in_water_either(angle_deg, planes_mm, scale):
     """A stage with errors of a twelfth of the distance of the planes is corrected elsewhere."""
     for seed in range(5):
         stage = 0.05 * np.random.default_rng(seed).standard_normal(len(planes_mm))
         experiment, dots = rig(scale * (planes_mm + stage), planes_mm, angle_deg=angle_deg, seed=seed)
-        assert check_depths(experiment, setup(angle_deg), dots) is None
+        assert mistaken_depths(experiment, setup(angle_deg), dots) is None
 
 
 @pytest.mark.parametrize("angle_deg", [-65.0, 0.0, 50.0])
@@ -110,7 +108,9 @@ def test_each_two_planes_in_each_others_place_are_named(angle_deg, planes_mm):
             continue  # the reverse order
         shown = np.array(planes_mm)
         shown[[one, other]] = shown[[other, one]]
-        assert f"planes {one} and {other} come into focus in each other's place" in said(shown, planes_mm, angle_deg)
+        experiment, dots = rig(shown, planes_mm, angle_deg=angle_deg)
+        with pytest.raises(InputError, match=f"planes {one} and {other} come into focus in each other's place"):
+            check_depths(experiment, setup(angle_deg), dots)
 
 
 @pytest.mark.parametrize("angle_deg", [-65.0, 0.0, 50.0])
@@ -123,6 +123,8 @@ def test_a_mistyped_depth_is_named_with_the_depth_that_fits(angle_deg, plane, st
     assert (int(found[1]), float(found[3])) == (plane, stated)
     assert float(found[2]) == pytest.approx(UNEVEN[plane], rel=DEPTH_ERROR)
     assert text.startswith(f"board/left/{plane}.tif: ")
+    experiment, dots = rig(UNEVEN, planes_mm, angle_deg=angle_deg)
+    assert check_depths(experiment, setup(angle_deg), dots) is None  # its dots will be left out
 
 
 @pytest.mark.parametrize("unit", [0.0254, 10.0, 25.4])
@@ -134,7 +136,7 @@ def test_depths_in_another_unit_are_named_with_those_that_fit(unit):
 
 def test_planes_in_the_reverse_order_are_left_to_the_search_for_mistakes():
     experiment, dots = rig(UNEVEN[::-1], UNEVEN)
-    check_depths(experiment, setup(40.0), dots)
+    assert mistaken_depths(experiment, setup(40.0), dots) is None
     assert "planes 0, 1, 2 and 3 come into focus in the reverse order" in reversed_order(experiment, setup(40.0), dots)
     experiment, dots = rig(UNEVEN, UNEVEN)
     assert reversed_order(experiment, setup(40.0), dots) is None

@@ -15,7 +15,7 @@ from support.small_run import leave_out
 import lfpiv
 from lfpiv import statistics
 from lfpiv.lightfield import image_checks, lattice_fit
-from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, dark_blocks, gap_light
+from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, dark_blocks, gap_light, same_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pair_vectors, pipeline
 from lfpiv.simulation.simulator import simulate
@@ -193,6 +193,30 @@ def test_a_frame_of_one_camera_with_both_exposures_is_told_whatever_the_pulses_h
     for name in first:
         assert told(first, {**second, name: both[name]}) == [(name, "second")]
         assert told({**first, name: both[name]}, second) == [(name, "first")]
+
+
+@pytest.mark.parametrize("noise", [0.4, 1.0, 5.0])
+@pytest.mark.parametrize("top", [250, 4000])
+def test_an_exposure_is_told_from_another_one_of_particles_at_rest(noise, top):
+    """The other one is clipped alike. A copy may have other pixels, a time in its corner, or another background."""
+    random = np.random.default_rng(0)
+    light = 3 * top * random.random((120, 160)) ** 20
+
+    def exposure():
+        return np.clip(np.rint(light + random.normal(7, noise, light.shape)), 0, top).astype(np.float32)
+
+    first, second = exposure(), exposure()
+    assert not same_light(first, second) and not same_light(first, np.roll(first, 5, axis=1))
+    for change in (first + 3, *(np.where(part, top, first) for part in _parts(first.shape))):
+        assert same_light(first, change)
+
+
+def _parts(shape):
+    """Yield no pixel, one in the middle, and the corner with a text."""
+    row, column = np.indices(shape)
+    yield np.zeros(shape, bool)
+    yield (row == shape[0] // 2) & (column == shape[1] // 2)
+    yield (row < 12) & (column < 60)
 
 
 @pytest.mark.parametrize(

@@ -283,3 +283,27 @@ def test_another_program_and_another_folder_of_the_same_name_have_everything_che
     monkeypatch.chdir(experiment.parent)
     monkeypatch.setattr(unchanged, "program", lambda: "another")
     assert repeated(experiment.name, out) is None
+
+
+def test_an_image_stored_again_with_another_pixel_is_named(finished, capfd):
+    """Files and their hashes differ. The right camera's images stay as they are."""
+    experiment, out = finished
+    first, last = (experiment.parent / "particles" / "left" / f"pair_000{pair}_a.tif" for pair in (0, 3))
+    image = tifffile.imread(first)
+    image[len(image) // 2, 100] += 1
+    tifffile.imwrite(last, image, compression="zlib")
+    run(experiment, out)
+    said = json.loads((out / "summary.json").read_text())["warnings"]
+    (named,) = [text for text in said if "has the same pixels" in text]
+    assert named.startswith("pair 3: an image has the same pixels, all or nearly all, as an image of pair 0")
+
+
+def test_a_second_frame_that_is_the_first_one_but_for_a_pixel_fails_its_pair(finished, capfd):
+    experiment, out = finished
+    first, second = (experiment.parent / "particles" / "left" / f"pair_0002_{frame}.tif" for frame in "ab")
+    image = tifffile.imread(first)
+    image[len(image) // 2, 100] = image.max() + 1
+    tifffile.imwrite(second, image)
+    run(experiment, out)
+    ((failed),) = json.loads((out / "summary.json").read_text())["failed"]
+    assert failed["pair"] == 2 and "found the same image as left, pair 2, frame a" in failed["reason"]
