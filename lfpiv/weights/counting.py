@@ -32,8 +32,8 @@ VOXELS = 6
 POOLS = 1 << 12, 1 << 18
 """Sizes of the random pools from which these voxels are drawn. The larger pool is used if the camera sees too few of
 the smaller one."""
-POINTS, SAMPLES = 16, 36
-"""Object points along each voxel edge and pupil points along each axis in a comparison: 4e6 rays per voxel, counted
+POINTS, SAMPLES = 12, 30
+"""Object points along each voxel edge and pupil points along each axis in a comparison: 1.2e6 rays per voxel, counted
 twice."""
 
 
