@@ -406,7 +406,10 @@ def same_light(first: np.ndarray, second: np.ndarray) -> bool:
     lit = (one < one.max()) & (other < other.max())
     if not lit.any():
         return False
-    bright = lit & (one >= np.quantile(one[lit], _BRIGHT))
+    level, background = np.quantile(one[lit], (_BRIGHT, 0.5))
+    bright = lit & (one >= level) & (one > background)  # few particles on a background without noise: these alone
+    if not bright.any():
+        return False
     change = other[bright].astype(float) - one[bright]
     return float(np.mean(np.abs(change - np.median(change)) < _SAME_COUNTS)) >= SAME
 

@@ -211,6 +211,14 @@ def test_an_exposure_is_told_from_another_one_of_particles_at_rest(noise, top):
         assert same_light(first, change)
 
 
+def test_few_particles_on_a_background_of_zeros_are_no_copy():
+    """They light fewer pixels than the brightest that are compared; the others are all alike."""
+    first, second = np.zeros((2, 120, 160), np.float32)
+    first[50:54, 40:48], second[50:54, 43:51] = np.random.default_rng(0).integers(20, 200, (2, 4, 8))
+    assert not same_light(first, second) and not same_light(first, np.zeros_like(first))
+    assert same_light(first, first.copy())
+
+
 def _parts(shape):
     """Yield no pixel, one in the middle, and the corner with a text."""
     row, column = np.indices(shape)
