@@ -114,7 +114,7 @@ SENTENCES: Mapping[Code, str] = {
     ),
     Code.UNEVEN: (
         "{parts:.0f} of 9 parts of the sensor are {ratio:g} times or more as bright in one frame as in the other; "
-        "check the laser's pulses and the shutter"
+        "check the laser's pulses, the shutter, and whether counts of one frame are shifted by some bits"
     ),
     Code.DOUBLE: (
         "the {holding} frame shows the light of the {held} one at the same pixels, beside its own: both pulses of the "

@@ -143,6 +143,13 @@ def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
     assert dark_blocks(first, half) >= 2 and dark_blocks(half, first) == dark_blocks(first, half)
 
 
+def test_a_frame_whose_counts_are_shifted_by_4_bits_is_told():
+    light = 50 * np.random.default_rng(0).random((120, 160)) ** 4
+    assert not image_checks.uneven_warnings(light, np.roll(light, 3, axis=1), "left")
+    (warning,) = image_checks.uneven_warnings(light, 16 * light, "left")
+    assert warning.sentence.startswith("left: 9 of 9 parts") and "shifted by some bits" in warning.sentence
+
+
 def test_particles_that_leave_a_part_of_the_sensor_do_not_make_it_dark():
     """Six particles: single ones carry the light of a part. Some cross its edge, one leaves the sensor."""
     rows, columns = np.mgrid[:400, :400]
