@@ -113,11 +113,13 @@ def mistaken_depths(
     The reverse of the whole order is named elsewhere. A camera without an orientation is not judged. `otherwise` are
     dots that were looked for at other depths. `single` says whether one plane elsewhere is named.
     """
+    if setup.orientation is None:
+        return None
     dots_per_plane = experiment.board.dots[0] * experiment.board.dots[1]
     focus = PlaneFocus.of(dots, dots_per_plane)
     if otherwise is not None:
         focus = focus.joined(PlaneFocus.of(otherwise, dots_per_plane))
-    if len(focus.number) < FEWEST_ORDERED or setup.orientation is None:
+    if len(focus.number) < FEWEST_ORDERED:
         return None
     stated, seen = np.asarray(experiment.board.planes_mm)[focus.number], focus.depth_mm(setup)
     before = _misfit(stated, seen)

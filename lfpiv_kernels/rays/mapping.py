@@ -119,7 +119,7 @@ def _kernel(sizes, batch, fan, has_lens):
     would take a minute to compile for fifteen layers.
     """
     inputs, outputs, hidden_layers = sizes[0], sizes[-1], len(sizes) - 2
-    first = _layer_starts(sizes)
+    first, width = _layer_starts(sizes), _width(sizes)
 
     @ti.kernel
     def _evaluate(
@@ -135,7 +135,7 @@ def _kernel(sizes, batch, fan, has_lens):
         rays = values_out.shape[0]
         for b in range((rays + batch - 1) // batch):
             raw = ti.Matrix.zero(ti.f32, inputs, batch)
-            held = ti.Matrix.zero(ti.f32, 2 * _width(sizes), batch)  # inputs and outputs of a layer in turn
+            held = ti.Matrix.zero(ti.f32, 2 * width, batch)  # inputs and outputs of a layer in turn
             value = ti.Matrix.zero(ti.f32, outputs, batch)
             for c in range(batch):
                 ray = ti.min(b * batch + c, rays - 1)
