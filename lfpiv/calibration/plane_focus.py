@@ -6,7 +6,8 @@ elsewhere than stated, or in another order, although labels with the wrong names
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -49,9 +50,9 @@ class PlaneFocus:
     """Median over the planes of the scatter of the slopes of a plane's dots."""
 
     @classmethod
-    def of(cls, dots: BoardDots, dots_per_plane: int) -> PlaneFocus:
+    def from_dots(cls, experiment: Experiment, dots: BoardDots) -> PlaneFocus:
         """Fit the slope of each plane's dots, linear over the field."""
-        plane = dots.measured_dot // dots_per_plane
+        plane = dots.measured_dot // math.prod(experiment.board.dots)
         slope = np.trace(dots.slope, axis1=1, axis2=2) / 2
         shown, seen, defocus, scatter = [], [], [], []
         for number in np.unique(plane):
@@ -67,7 +68,7 @@ class PlaneFocus:
         return cls(np.array(shown, int), np.array(seen, int), np.array(defocus), typical)
 
     def joined(self, other: PlaneFocus) -> PlaneFocus:
-        """Return each plane as that search for dots shows it which found more of them."""
+        """Return the focus of each plane by the search for dots that found more in it."""
         both = [np.concatenate(pair) for pair in zip(self._columns, other._columns, strict=True)]
         order = np.lexsort((-both[1], both[0]))
         number, seen, defocus = (column[order] for column in both)
@@ -89,7 +90,7 @@ class PlaneFocus:
 def check_depths(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> None:
     """Refuse planes in each other's place, and depths in another unit, as the focus shows them.
 
-    A single plane elsewhere is none of that: its dots do not fit the others and are left out with a warning.
+    A single plane elsewhere is not refused here. Its dots do not fit the others, and are left out with a warning.
 
     Raises
     ------
@@ -115,10 +116,9 @@ def mistaken_depths(
     """
     if setup.orientation is None:
         return None
-    dots_per_plane = experiment.board.dots[0] * experiment.board.dots[1]
-    focus = PlaneFocus.of(dots, dots_per_plane)
+    focus = PlaneFocus.from_dots(experiment, dots)
     if otherwise is not None:
-        focus = focus.joined(PlaneFocus.of(otherwise, dots_per_plane))
+        focus = focus.joined(PlaneFocus.from_dots(experiment, otherwise))
     if len(focus.number) < FEWEST_ORDERED:
         return None
     stated, seen = np.asarray(experiment.board.planes_mm)[focus.number], focus.depth_mm(setup)
@@ -136,23 +136,30 @@ def mistaken_depths(
     found = min(_mistakes(stated, seen), key=lambda one: one.misfit)
     if not found.misfit < min(FITS, CLEARLY * before) or (len(found.planes) == 1 and not single):
         return None
-    files = ", ".join(str(experiment.board_path(setup.name, int(focus.number[place]))) for place in found.planes)
     text = found.text(focus.number, experiment.board.planes_mm)
-    return f"{files}: board.images of camera {setup.name!r}: {text}"
+    return f"{_images(experiment, setup, focus.number[list(found.planes)])}: {text}"
+
+
+def _images(experiment: Experiment, setup: CameraSetup, planes: Iterable[int]) -> str:
+    """Name a camera's images of some planes, as messages begin."""
+    files = ", ".join(str(experiment.board_path(setup.name, int(plane))) for plane in planes)
+    return f"{files}: board.images of camera {setup.name!r}"
 
 
 def reversed_order(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> str | None:
-    """Say which planes come into focus in the reverse order of their depths; None if they do not, or are not judged."""
-    focus = PlaneFocus.of(dots, experiment.board.dots[0] * experiment.board.dots[1])
+    """Say which planes come into focus in the reverse order of their depths; None if they do not.
+
+    A camera without an orientation is not judged.
+    """
+    focus = PlaneFocus.from_dots(experiment, dots)
     if len(focus.number) < 2 or setup.orientation is None:
         return None
     order = np.argsort(np.asarray(experiment.board.planes_mm)[focus.number])
     if not (np.diff(focus.depth_mm(setup)[order]) < 0).all():
         return None
     names = [str(number) for number in focus.number]
-    files = ", ".join(str(experiment.board_path(setup.name, int(number))) for number in focus.number)
     return (
-        f"{files}: board.images of camera {setup.name!r}: planes {', '.join(names[:-1])} and {names[-1]} come into "
+        f"{_images(experiment, setup, focus.number)}: planes {', '.join(names[:-1])} and {names[-1]} come into "
         "focus in the reverse order of their depths in board.planes_mm. Are their images exchanged?"
     )
 
@@ -168,7 +175,7 @@ def check_order(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> 
     InputError
         Names the planes and their files.
     """
-    focus = PlaneFocus.of(dots, experiment.board.dots[0] * experiment.board.dots[1])
+    focus = PlaneFocus.from_dots(experiment, dots)
     shown, defocus = focus.number, focus.defocus
     if len(shown) < FEWEST_ORDERED:
         return
@@ -181,9 +188,8 @@ def check_order(experiment: Experiment, setup: CameraSetup, dots: BoardDots) -> 
         raise InputError(text)
     seen = np.argsort(defocus if growing > falling else -defocus)
     displaced = sorted(map(int, shown[stated[stated != seen]]))
-    files = ", ".join(str(experiment.board_path(setup.name, number)) for number in displaced)
     raise InputError(
-        f"{files}: board.images of camera {setup.name!r}: expected dots that come into focus in the order of "
+        f"{_images(experiment, setup, displaced)}: expected dots that come into focus in the order of "
         f"board.planes_mm, found planes {', '.join(map(str, displaced))} in another order. Are their images exchanged, "
         "or is a depth in board.planes_mm mistyped?"
     )

@@ -316,7 +316,7 @@ class _BrightLight:
 
     @classmethod
     def of(cls, image: np.ndarray) -> _BrightLight:
-        pixels = image.ravel()[:: 1 + image.size // _BRIGHT_SAMPLES]
+        pixels = _sample(image)
         level = max(float(np.quantile(pixels, _BRIGHT)), 1e-9)
         bright = pixels[pixels >= level]
         return cls(pixels, level, float(bright.mean()) if bright.size else 0.0)
@@ -328,6 +328,11 @@ class _BrightLight:
         """
         bright = self.pixels >= level * self.level
         return float(np.quantile(other.pixels[bright] / self.pixels[bright], lost)) if bright.any() else 0.0
+
+
+def _sample(image: np.ndarray) -> np.ndarray:
+    """Return the pixels of an image; of a large one every n-th, `_BRIGHT_SAMPLES` at most."""
+    return image.ravel()[:: 1 + image.size // _BRIGHT_SAMPLES]
 
 
 def signal_warnings(structure: Mapping[str, float], frame: str | None) -> list[Warning]:
@@ -400,7 +405,7 @@ def same_light(first: np.ndarray, second: np.ndarray) -> bool:
     first, second : ndarray, shape (rows, columns)
         Images [counts].
     """
-    one, other = (image.ravel()[:: 1 + image.size // _BRIGHT_SAMPLES] for image in (first, second))
+    one, other = _sample(first), _sample(second)
     if one.shape != other.shape:
         return False
     lit = (one < one.max()) & (other < other.max())
