@@ -27,10 +27,10 @@ from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment, white_level
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
+from lfpiv.lightfield.frame_comparison import fingerprint
 from lfpiv.lightfield.image_checks import (
     APERTURE,
     OTHER_APERTURE,
-    fingerprint,
     microimage_px,
     stated_px,
 )

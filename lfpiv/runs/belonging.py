@@ -14,7 +14,7 @@ from functools import reduce
 from itertools import chain, islice
 from typing import TYPE_CHECKING
 
-from lfpiv.lightfield.image_checks import dark_blocks
+from lfpiv.lightfield.frame_comparison import dark_blocks
 from lfpiv.reconstruction.image_preparation import DIMMEST
 from lfpiv.runs import moved_cameras
 from lfpiv.runs.moved_cameras import CameraDisparity, ShownParticles

@@ -16,7 +16,7 @@ import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.recording import Frame
-from lfpiv.lightfield import image_checks
+from lfpiv.lightfield import frame_comparison, image_checks
 from lfpiv.lightfield.particle_signal import NOISE, seen_structure
 from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.lightfield.standing_light import remains_warnings
@@ -84,7 +84,7 @@ def frame_light(
         light = images[name]
         clipped[name] = saturated_pixels(raw, top)
         structure[name] = seen_structure(light, camera.decoder)
-        fingerprints[name] = image_checks.fingerprint(raw)
+        fingerprints[name] = frame_comparison.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
         others = {other: one.decoder for other, one in cameras.items() if other != name}
         warnings += image_checks.image_warnings(judged, light, camera.decoder, name, frame.name, top, others)
@@ -119,9 +119,9 @@ def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: 
     InputError
         If two images are the same, pixel by pixel or but for some pixels.
     """
-    repeats = [name for name in cameras if image_checks.same_light(first.images[name], second.images[name])]
+    repeats = [name for name in cameras if frame_comparison.same_light(first.images[name], second.images[name])]
     marks = {**second.fingerprints, **{name: first.fingerprints[name] for name in repeats}}
-    image_checks.require_different(
+    frame_comparison.require_different(
         (f"{name}, {one.frame.label}", fingerprint)
         for one, fingerprints in ((first, first.fingerprints), (second, marks))
         for name, fingerprint in fingerprints.items()
@@ -129,7 +129,7 @@ def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: 
     uneven = [
         warning
         for name in cameras
-        for warning in image_checks.uneven_warnings(first.images[name], second.images[name], name)
+        for warning in frame_comparison.uneven_warnings(first.images[name], second.images[name], name)
     ]
     remains = [
         warning
@@ -137,7 +137,7 @@ def compare(cameras: Mapping[str, CalibratedCamera], first: FrameLight, second: 
         if camera.standing is not None
         for warning in remains_warnings(camera.standing, first.images[name], second.images[name], name)
     ]
-    double = [] if uneven else image_checks.double_warnings(first.images, second.images)
+    double = [] if uneven else frame_comparison.double_warnings(first.images, second.images)
     return (*uneven, *double, *remains)
 
 

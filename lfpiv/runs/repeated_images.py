@@ -16,7 +16,7 @@ from lfpiv.damping.bootstrap import evenly_spread
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import Experiment
 from lfpiv.experiment.recording import Frame
-from lfpiv.lightfield.image_checks import same_light
+from lfpiv.lightfield.frame_comparison import same_light
 from lfpiv.runs.pair_figures import PairFigures
 
 NEAR = 2e-3

@@ -14,8 +14,9 @@ from support.small_run import leave_out
 
 import lfpiv
 from lfpiv import statistics
-from lfpiv.lightfield import image_checks, lattice_fit
-from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, dark_blocks, gap_light, same_light
+from lfpiv.lightfield import frame_comparison, image_checks, lattice_fit
+from lfpiv.lightfield.frame_comparison import dark_blocks, same_light
+from lfpiv.lightfield.image_checks import GAP_LIGHT, NO_PLACE, gap_light
 from lfpiv.results import netcdf
 from lfpiv.runs import pair_vectors, pipeline
 from lfpiv.simulation.simulator import simulate
@@ -145,8 +146,8 @@ def test_the_frames_of_a_pair_are_lit_alike(pair_of_cameras):
 
 def test_a_frame_whose_counts_are_shifted_by_4_bits_is_told():
     light = 50 * np.random.default_rng(0).random((120, 160)) ** 4
-    assert not image_checks.uneven_warnings(light, np.roll(light, 3, axis=1), "left")
-    (warning,) = image_checks.uneven_warnings(light, 16 * light, "left")
+    assert not frame_comparison.uneven_warnings(light, np.roll(light, 3, axis=1), "left")
+    (warning,) = frame_comparison.uneven_warnings(light, 16 * light, "left")
     assert warning.sentence.startswith("left: 9 of 9 parts") and "shifted by some bits" in warning.sentence
 
 
@@ -171,15 +172,15 @@ def test_suspicious_images_are_found(pair_of_cameras):
     def found(image):
         return [item.code for item in image_checks.image_warnings(image, image - 40, decoder, "left", "a")]
 
-    assert found(first) == found(second) == image_checks.uneven_warnings(first, second, "left") == []
+    assert found(first) == found(second) == frame_comparison.uneven_warnings(first, second, "left") == []
     assert found(np.roll(first, QUARTER_PITCH_PX, axis=1)) == [Code.SHIFTED]
     assert found(np.minimum(first * 40, 4095)) == [Code.SATURATED]
     assert found(np.round(4095 * (first / 4095) ** (1 / 2.2))) == [Code.TONE_CURVE]
-    assert [item.code for item in image_checks.uneven_warnings(first, second * 0.05, "left")] == [Code.UNEVEN]
-    images = [(name, image_checks.fingerprint(image)) for name, image in (("one", first), ("other", second))]
-    image_checks.require_different(images)
+    assert [item.code for item in frame_comparison.uneven_warnings(first, second * 0.05, "left")] == [Code.UNEVEN]
+    images = [(name, frame_comparison.fingerprint(image)) for name, image in (("one", first), ("other", second))]
+    frame_comparison.require_different(images)
     with pytest.raises(lfpiv.InputError, match=r"a copy: .* found the same image as one\. Check particles\.images"):
-        image_checks.require_different([*images, ("a copy", image_checks.fingerprint(first.copy()))])
+        frame_comparison.require_different([*images, ("a copy", frame_comparison.fingerprint(first.copy()))])
 
 
 @pytest.mark.parametrize("energy", [0.8, 1.0, 1.25])
@@ -191,7 +192,7 @@ def test_a_frame_of_one_camera_with_both_exposures_is_told_whatever_the_pulses_h
     slow = {name: energy * (image + np.roll(image, 1, 0)) / 2 for name, image in first.items()}
 
     def told(one, other):
-        found = image_checks.double_warnings(one, other)
+        found = frame_comparison.double_warnings(one, other)
         return [(item.subject, item.figures["holding"]) for item in found]
 
     doubled = {name: 2 * image for name, image in second.items()}
