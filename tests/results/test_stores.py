@@ -19,7 +19,7 @@ from lfpiv import statistics
 from lfpiv.results import netcdf, stacked_files, store_seal, stores
 from lfpiv.velocity import statistics as streaming
 
-NUMBERS = (0, 1, 3, 4, 7, 8, 9)
+NUMBERS = (0, 1, 3, 4, 9)
 STEP = 2
 ROUNDING = 1e-12  # sums in another order
 
@@ -47,11 +47,25 @@ def dask(request, monkeypatch):
     return request.param == "dask"
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return the folders of a run on image pairs and of one on a time series. Tests export copies of them."""
+    folder = tmp_path_factory.mktemp("written")
+    write_run(folder / "pairs", NUMBERS)
+    write_series(folder / "series", NUMBERS)
+    return folder
+
+
 @pytest.fixture(params=["pairs", "series"])
-def run(request, tmp_path):
+def run(request, written, tmp_path):
     """Return the folder of a run on image pairs, and of one on a time series."""
-    (write_run if request.param == "pairs" else write_series)(tmp_path / "out", NUMBERS)
-    return tmp_path / "out"
+    return shutil.copytree(written / request.param, tmp_path / "out")
+
+
+@pytest.fixture
+def pairs(written, tmp_path):
+    """Return the folder of a run on image pairs."""
+    return shutil.copytree(written / "pairs", tmp_path / "out")
 
 
 @pytest.fixture(params=["zarr", "netcdf"])
@@ -75,7 +89,7 @@ def test_a_store_is_the_folder(run, form, dask):
     }
     along = store.u.dims[0]
     part = lfpiv.open_results(path, pairs=(2, 8))
-    assert part[along].values.tolist() == [3, 4, 7]
+    assert part[along].values.tolist() == [3, 4]
     with pytest.raises(lfpiv.InputError, match="found 0 to 9"):
         lfpiv.open_results(path, pairs=(20, None))
 
@@ -99,18 +113,16 @@ def test_chunks_suit_a_point_and_a_field(run, form):
     assert chunks[0] == 2 and 4 * np.prod(chunks) <= 500 < 8 * np.prod(chunks)
 
 
-def test_results_of_other_settings_replace_the_store(tmp_path):
+def test_results_of_other_settings_replace_the_store(pairs):
     pytest.importorskip("zarr")
-    write_run(tmp_path, NUMBERS)
-    (path,) = lfpiv.export_results(tmp_path, "zarr")
-    write_run(tmp_path, NUMBERS[:3], smart={"iterations": 5})
-    lfpiv.export_results(tmp_path, "zarr", pairs=(0, 4))
+    (path,) = lfpiv.export_results(pairs, "zarr")
+    write_run(pairs, NUMBERS[:3], smart={"iterations": 5})
+    lfpiv.export_results(pairs, "zarr", pairs=(0, 4))
     store = lfpiv.open_results(path)
     assert json.loads(store.attrs["smart"]) == {"iterations": 5} and store.sizes["pair"] == 3
 
 
-def test_a_killed_export_leaves_nothing(tmp_path, form, monkeypatch):
-    write_run(tmp_path, NUMBERS)
+def test_a_killed_export_leaves_nothing(pairs, form, monkeypatch):
     inner = stacked_files.StackedFiles.block
 
     def fail(self, first, after):
@@ -120,8 +132,8 @@ def test_a_killed_export_leaves_nothing(tmp_path, form, monkeypatch):
 
     monkeypatch.setattr(stacked_files.StackedFiles, "block", fail)
     with pytest.raises(KeyboardInterrupt):
-        lfpiv.export_results(tmp_path, form)
-    assert not (tmp_path / "export").exists()
+        lfpiv.export_results(pairs, form)
+    assert not (pairs / "export").exists()
 
 
 def test_nothing_else_is_taken_for_a_store_or_removed(tmp_path):
@@ -153,9 +165,8 @@ def test_older_packages_are_named(tmp_path, monkeypatch, package):
     assert not (tmp_path / "export").exists()
 
 
-def test_a_damaged_chunk_is_not_read_in_silence(tmp_path, form, monkeypatch):
-    write_run(tmp_path, NUMBERS)
-    (path,) = lfpiv.export_results(tmp_path, form)
+def test_a_damaged_chunk_is_not_read_in_silence(pairs, form, monkeypatch):
+    (path,) = lfpiv.export_results(pairs, form)
     chunk = path if form == "netcdf" else max((path / "u" / "c").rglob("[0-9]*"))
     content = bytearray(chunk.read_bytes())
     if form == "netcdf":
@@ -214,19 +225,20 @@ def put_pipe(path):
 
 
 @pytest.mark.slow(but="change_values-True")
-@pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("forge", [change_values, change_interval, remove_chunk, put_pipe])
-def test_a_forged_store_is_refused_and_written_anew(tmp_path, form, forge, whole, monkeypatch):
-    """Also where a store is too large to read all of it: sizes, metadata and axes tell."""
-    write_run(tmp_path, NUMBERS)
-    (path,) = lfpiv.export_results(tmp_path, form)
+@pytest.mark.parametrize(
+    ("forge", "whole"),
+    [(change_values, True), *((forge, False) for forge in (change_values, change_interval, remove_chunk, put_pipe))],
+)
+def test_a_forged_store_is_refused_and_written_anew(pairs, form, forge, whole, monkeypatch):
+    """Where a store is too large to read all of it, sizes, metadata and axes tell; otherwise they are compared too."""
+    (path,) = lfpiv.export_results(pairs, form)
     wanted = lfpiv.open_results(path).load()
     if not whole:
         monkeypatch.setattr(store_seal, "WHOLE_BYTES", 0)
     forge(path)
     with pytest.raises(lfpiv.InputError, match=path.name):
         lfpiv.open_results(path)
-    lfpiv.export_results(tmp_path, form)
+    lfpiv.export_results(pairs, form)
     xr.testing.assert_identical(lfpiv.open_results(path).load(), wanted)
 
 
@@ -291,10 +303,9 @@ def test_a_store_holds_nothing_but_its_arrays(tmp_path, other):
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypatch):
+def test_a_disk_that_fills_up_anywhere_leaves_no_store(pairs, form, monkeypatch):
     """HDF5 would crash the process. No disk, but files that may not grow: all of them, or only the last bytes."""
-    write_run(tmp_path, NUMBERS)
-    (path,) = lfpiv.export_results(tmp_path, form)
+    (path,) = lfpiv.export_results(pairs, form)
     largest = max(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -302,13 +313,13 @@ def test_a_disk_that_fills_up_anywhere_leaves_no_store(tmp_path, form, monkeypat
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
         try:
             with pytest.raises(lfpiv.errors.StorageError, match="cannot be written: file too large"):
-                lfpiv.export_results(tmp_path, form)
+                lfpiv.export_results(pairs, form)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        left = list((tmp_path / "export").iterdir()) if (tmp_path / "export").exists() else []
+        left = list((pairs / "export").iterdir()) if (pairs / "export").exists() else []
         assert left == []
-    lfpiv.export_results(tmp_path, form)
-    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(tmp_path).load())
+    lfpiv.export_results(pairs, form)
+    xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(pairs).load())
 
 
 def test_two_exports_at_once_leave_a_whole_store(tmp_path, form, monkeypatch):
@@ -361,9 +372,9 @@ def test_statistics_in_parts_are_those_of_the_whole(run, block, monkeypatch):
 
 @pytest.mark.slow
 def test_statistics_hold_a_block_and_not_the_run(tmp_path, monkeypatch):
-    """Without dask, 60 files are averaged in much less memory than they take."""
+    """Without dask, 30 files are averaged in much less memory than they take."""
     hide_dask(monkeypatch)
-    shape, count, block = (8, 32, 32), 60, 1 << 20
+    shape, count, block = (8, 32, 32), 30, 1 << 19
     for number in range(count):
         write_run(tmp_path, (number,), shape=shape)
     monkeypatch.setattr(streaming, "BLOCK_BYTES", block)
@@ -374,5 +385,5 @@ def test_statistics_hold_a_block_and_not_the_run(tmp_path, monkeypatch):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     whole = 3 * 8 * count * np.prod(shape)
-    assert results.sizes["pair"] == count and 30 < float(average.pairs_counted.mean()) < count
+    assert results.sizes["pair"] == count and count / 2 < float(average.pairs_counted.mean()) < count
     assert peak < 6 * block < whole / 1.8
