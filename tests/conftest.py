@@ -137,6 +137,14 @@ def small_run(tmp_path_factory, device):
     return made_once(tmp_path_factory, "small", lambda folder: make_small_run(folder, device.kind))
 
 
+@pytest.fixture(scope="session")
+def coarse_run(small_run, tmp_path_factory, device):
+    """Return the small run with coarser voxels, whose pairs take half the time, for tests of files and processes."""
+    from support.small_run import make_coarse_run
+
+    return made_once(tmp_path_factory, "coarse", lambda folder: make_coarse_run(small_run, folder, device.kind))
+
+
 @pytest.fixture
 def brief_run(monkeypatch):
     """Run without report, comparison of cameras and odd pairs."""

@@ -51,9 +51,9 @@ def edited(experiment, old, new):
 
 @pytest.mark.whole_run
 @pytest.mark.slow
-def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path, monkeypatch):
-    experiment, _ = lit(small_run, tmp_path / "data")
-    whole, part = (small_run.calibrated(tmp_path / name) for name in ("whole", "part"))
+def test_a_streak_is_found_subtracted_and_stored_once(coarse_run, tmp_path, monkeypatch):
+    experiment, _ = lit(coarse_run, tmp_path / "data")
+    whole, part = (coarse_run.calibrated(tmp_path / name) for name in ("whole", "part"))
     summary = pipeline.run(experiment, whole, pairs=(0, 1))
     assert set(summary["background"]) == {"left", "right"}
     assert (whole / "report.html").read_text("utf-8").count("Light that stands still in left, frame") == 2
@@ -71,9 +71,9 @@ def test_a_streak_is_found_subtracted_and_stored_once(small_run, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_standing_light_that_is_not_subtracted_is_named_with_the_remedy(small_run, tmp_path):
-    experiment, _ = lit(small_run, tmp_path / "data")
-    out = small_run.calibrated(tmp_path / "out")
+def test_standing_light_that_is_not_subtracted_is_named_with_the_remedy(coarse_run, tmp_path):
+    experiment, _ = lit(coarse_run, tmp_path / "data")
+    out = coarse_run.calibrated(tmp_path / "out")
     before = pipeline.run(edited(experiment, "[particles]\n", '[particles]\nbackground = "none"\n'), out, pairs=(0, 1))
     found = [record for record in before["warning_records"] if record["code"] == "standing"]
     assert {record["subject"] for record in found} == {"left", "right"}
@@ -83,8 +83,8 @@ def test_standing_light_that_is_not_subtracted_is_named_with_the_remedy(small_ru
     assert "vectors of pair 0" not in after["reused"] and not any("stands still" in text for text in after["warnings"])
 
 
-def test_a_background_image_is_checked_like_the_others(small_run, tmp_path):
-    experiment, streaks = lit(small_run, tmp_path / "data")
+def test_a_background_image_is_checked_like_the_others(coarse_run, tmp_path):
+    experiment, streaks = lit(coarse_run, tmp_path / "data")
     edited(experiment, 'name = "left"\n', 'name = "left"\nbackground_image = "empty_{frame}.tif"\n')
     with pytest.raises(InputError, match=r"empty_a\.tif \(background_image of camera 'left'\).*no such file"):
         read_experiment(experiment)
@@ -101,8 +101,8 @@ def test_a_background_image_is_checked_like_the_others(small_run, tmp_path):
         read_experiment(experiment)
 
 
-def test_two_ways_to_a_background_are_refused(small_run, tmp_path):
-    experiment = small_run.images(tmp_path / "data")
+def test_two_ways_to_a_background_are_refused(coarse_run, tmp_path):
+    experiment = coarse_run.images(tmp_path / "data")
     edited(experiment, 'name = "left"\n', 'name = "left"\nbackground_image = "empty.tif"\n')
     edited(experiment, "[particles]\n", '[particles]\nbackground = "median"\n')
     with pytest.raises(InputError, match=r"background_image: expected particles\.background"):
@@ -110,14 +110,14 @@ def test_two_ways_to_a_background_are_refused(small_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_with_a_background_image_the_vectors_are_true(small_run, tmp_path):
-    experiment, streaks = lit(small_run, tmp_path / "data")
+def test_with_a_background_image_the_vectors_are_true(coarse_run, tmp_path):
+    experiment, streaks = lit(coarse_run, tmp_path / "data")
     text = experiment.read_text()
     for name in streaks:
         tifffile.imwrite(experiment.parent / f"{name}.tif", np.rint(streaks[name] + 40).astype(np.uint16))
         text = text.replace(f'name = "{name}"\n', f'name = "{name}"\nbackground_image = "{name}.tif"\n')
     experiment.write_text(text)
-    out = small_run.calibrated(tmp_path / "out")
+    out = coarse_run.calibrated(tmp_path / "out")
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     np.testing.assert_allclose(mean_displacement(out, 0), DISPLACEMENT_VOXEL, atol=TOLERANCE_VOXEL)
     assert json.loads((out / "summary.json").read_text())["background"] == summary["background"] != {}

@@ -98,17 +98,17 @@ def cluster(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_run, tmp_path, cluster):
+def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(coarse_run, tmp_path, cluster):
     """Kill -9 the run, then in the next run a worker; let the scheduler hang for a while: the same numbers."""
     address, scheduler, start_worker = cluster
-    out, worker = small_run.prepared(tmp_path / "out"), start_worker()
-    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
+    out, worker = coarse_run.prepared(tmp_path / "out"), start_worker()
+    run = start("run", coarse_run.experiment, "--out", out, "--scheduler", address)
     wait_for(lambda: finished(out), run, "finished pair")
     (dead,) = (out / ".shared").iterdir()
     run.kill()
     run.communicate()
     assert 0 < len(finished(out)) < PAIRS and worker.poll() is None
-    run = start("run", small_run.experiment, "--out", out, "--scheduler", address)
+    run = start("run", coarse_run.experiment, "--out", out, "--scheduler", address)
     shared = wait_for(lambda: not dead.exists() and next((out / ".shared").glob("[!.]*"), None), run, "shared weights")
     wait_for(lambda: workers_of(worker, str(shared)), run, "pair")[0].kill()
     scheduler.send_signal(signal.SIGSTOP)
@@ -117,7 +117,7 @@ def test_a_cluster_outlives_a_killed_run_and_a_run_outlives_its_workers(small_ru
     scheduler.send_signal(signal.SIGCONT)
     _, said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, said
-    assert same_vectors(small_run.out, out) == PAIRS and whole(out)
+    assert same_vectors(coarse_run.out, out) == PAIRS and whole(out)
     assert worker.poll() is None and scheduler.poll() is None, "the cluster is not ours to end"
 
 
@@ -135,13 +135,13 @@ kill -- "-$1"
 
 
 @pytest.mark.slow
-def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
+def test_under_slurm_a_cancelled_job_is_replaced(coarse_run, tmp_path):
     """The documented script and dask-jobqueue, processes for jobs: one job is cancelled, one pair cannot be done."""
     (tmp_path / "bin").mkdir()
     for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
         (tmp_path / "bin" / name).write_text(text)
         (tmp_path / "bin" / name).chmod(0o755)
-    experiment, out = small_run.images(tmp_path / "data"), small_run.prepared(tmp_path / "out")
+    experiment, out = coarse_run.images(tmp_path / "data"), coarse_run.prepared(tmp_path / "out")
     damage(next((tmp_path / "data").rglob("*0003*")))
     command = [sys.executable, ROOT / "docs" / "slurm.py", experiment.relative_to(tmp_path), "out", "--jobs", "1"]
     environment = {
@@ -165,16 +165,16 @@ def test_under_slurm_a_cancelled_job_is_replaced(small_run, tmp_path):
     assert "pair 3:" in written and "damaged" in written
     assert "pair 0: " in said and "kernels run on cpu" in said and "1 thread" in said, "what workers log is lost"
     assert len(list(tmp_path.glob("*.job"))) > 1 and (tmp_path / "slurm-logs").is_dir()
-    for folder in (reference := small_run.results(tmp_path / "reference"), out):
+    for folder in (reference := coarse_run.results(tmp_path / "reference"), out):
         (folder / "vectors" / "pair_0003.nc").unlink(missing_ok=True)
     assert same_vectors(reference, out) == PAIRS - 1 and whole(out)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "options"), [(signal.SIGINT, ["--workers", "2"]), (signal.SIGTERM, [])])
-def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(small_run, tmp_path, number, options):
-    out = small_run.prepared(tmp_path / "out")
-    file = small_run.images(tmp_path / "data")
+def test_an_interrupted_run_ends_cleanly_and_says_how_to_go_on(coarse_run, tmp_path, number, options):
+    out = coarse_run.prepared(tmp_path / "out")
+    file = coarse_run.images(tmp_path / "data")
     slow = file.read_text("utf-8").replace("iterations = 8", "iterations = 400\ntolerance = 0.0")
     assert slow.count("iterations = 400") == 1
     file.write_text(slow, "utf-8")  # seconds for each pair: none may be done before the signal comes
@@ -195,11 +195,11 @@ def mounts():
 
 
 @pytest.mark.slow
-def test_a_full_disk_leaves_nothing_half_written(small_run, tmp_path):
+def test_a_full_disk_leaves_nothing_half_written(coarse_run, tmp_path):
     """The second pair's vectors do not fit: one clear message, status 1, every file whole."""
-    out = small_run.prepared(tmp_path / "out")
-    room = (small_run.out / "vectors" / "pair_0000.nc").stat().st_size
-    command = [sys.executable, "-c", BRIEF, "run", str(small_run.experiment), "--out", str(out)]
+    out = coarse_run.prepared(tmp_path / "out")
+    room = (coarse_run.out / "vectors" / "pair_0000.nc").stat().st_size
+    command = [sys.executable, "-c", BRIEF, "run", str(coarse_run.experiment), "--out", str(out)]
     (out / "vectors").mkdir()
     if mounts():  # the listing shows what is on the small disk, which ends with the namespace
         mount = f"mount -t tmpfs -o size={3 * room // 2} tmpfs {out}/vectors"
@@ -225,17 +225,17 @@ with Folder(Path(sys.argv[1])).held():
 """
 
 
-def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd):
+def test_a_second_run_on_one_folder_is_refused(coarse_run, tmp_path, capfd):
     """It names who holds the folder; a report may be made meanwhile; kill -9 leaves no stale lock."""
-    out = small_run.results(tmp_path / "out")
+    out = coarse_run.results(tmp_path / "out")
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, out], stdout=subprocess.PIPE, text=True)
     try:
         assert holder.stdout.readline() == "held\n"
         for command in ("run", "calibrate", "reconstruct", "correlate"):
-            assert commands.call([command, str(small_run.experiment), "--out", str(out)]) == 2
+            assert commands.call([command, str(coarse_run.experiment), "--out", str(out)]) == 2
             said = capfd.readouterr().err.splitlines()[-1]
             assert f"process {holder.pid}" in said and "no other run writes to" in said
-        assert commands.call(["report", str(small_run.experiment), "--out", str(out)]) == 0
+        assert commands.call(["report", str(coarse_run.experiment), "--out", str(out)]) == 0
     finally:
         holder.kill()
         holder.wait()
@@ -245,12 +245,12 @@ def test_a_second_run_on_one_folder_is_refused(small_run, tmp_path, capfd):
     assert not (out / ".lock").exists()
 
 
-def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatch):
+def test_bad_pairs_are_named_and_left_out(coarse_run, tmp_path, capfd, monkeypatch):
     """Missing, of another shape, not finite, gone when its turn comes; the first pair must be whole."""
     import numpy as np
     import tifffile
 
-    experiment, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+    experiment, out = coarse_run.images(tmp_path / "data"), coarse_run.calibrated(tmp_path / "out")
     images = [next((tmp_path / "data").rglob(f"*000{pair}*")) for pair in range(PAIRS)]
     images[1].unlink()
     tifffile.imwrite(images[2], np.ones((40, 30), np.uint16))
@@ -277,9 +277,9 @@ def test_bad_pairs_are_named_and_left_out(small_run, tmp_path, capfd, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(small_run, tmp_path, capfd):
+def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(coarse_run, tmp_path, capfd):
     """Each status tells of its own invocation; results of other images than there are now are put aside."""
-    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    experiment, out = coarse_run.images(tmp_path / "data"), coarse_run.results(tmp_path / "out")
     spoilt = next((tmp_path / "data").rglob("*0002*"))
     good, stated = spoilt.read_bytes(), experiment.read_text()
     damage(spoilt)
@@ -309,13 +309,13 @@ def test_a_failed_pair_blocks_no_other_and_its_failure_ends_when_it_is_mended(sm
     spoilt.write_bytes(good)
     assert called("reconstruct", "--pairs", "2:") == (0, [], [0, 1, 3])
     assert called("run", "--keep-volumes") == (0, [], [0, 1, 2, 3])
-    assert same_vectors(small_run.out, out) == PAIRS and not list(out.rglob("*.outdated"))
+    assert same_vectors(coarse_run.out, out) == PAIRS and not list(out.rglob("*.outdated"))
 
 
 @pytest.mark.slow
-def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tmp_path, capfd):
+def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(coarse_run, tmp_path, capfd):
     """Stopped after pair 0; pair 1 is damaged, and its volumes are not needed where its images are gone."""
-    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    experiment, out = coarse_run.images(tmp_path / "data"), coarse_run.results(tmp_path / "out")
     for pair in (1, 2, 3):
         (out / "vectors" / f"pair_000{pair}.nc").unlink()
     damage(next((tmp_path / "data").rglob("*0001*")))
@@ -326,24 +326,24 @@ def test_a_run_that_goes_on_does_not_end_at_the_first_damaged_pair(small_run, tm
     assert sorted(finished(out)) == [f"pair_000{pair}.nc" for pair in (0, 2, 3)]
 
 
-def test_a_bad_image_of_the_calibration_is_bad_input(small_run, tmp_path, capfd):
-    experiment = small_run.images(tmp_path / "data")
+def test_a_bad_image_of_the_calibration_is_bad_input(coarse_run, tmp_path, capfd):
+    experiment = coarse_run.images(tmp_path / "data")
     plane = sorted((tmp_path / "data").rglob("*plane*"))[3]
     damage(plane)
     assert commands.call(["run", str(experiment), "--out", str(tmp_path / "out")]) == 2
     assert Path(plane).name in capfd.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_more_pairs_than_there_are_images_are_refused_before_any_work(small_run, tmp_path, capfd):
+def test_more_pairs_than_there_are_images_are_refused_before_any_work(coarse_run, tmp_path, capfd):
     """A selection of those that are there is done, with a warning of the others."""
-    experiment, out = small_run.images(tmp_path / "data"), tmp_path / "out"
+    experiment, out = coarse_run.images(tmp_path / "data"), tmp_path / "out"
     experiment.write_text(experiment.read_text().replace(f"pairs = {PAIRS}", f"pairs = {PAIRS + 3}"))
     assert commands.call(["run", str(experiment), "--out", str(out)]) == 2
     (said,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("lfpiv: ")]
     for words in (f"particles.pairs: expected the images of {PAIRS + 3} pairs", f"found those of {PAIRS}"):
         assert words in said, said
     assert f"State particles.pairs = {PAIRS}" in said and f"--pairs 0:{PAIRS}" in said and not out.exists()
-    out = small_run.results(tmp_path / "finished")
+    out = coarse_run.results(tmp_path / "finished")
     (out / "vectors" / "pair_0001.nc").unlink()
     assert commands.call(["run", str(experiment), "--out", str(out), "--pairs", f"0:{PAIRS}"]) == 0
     said = capfd.readouterr().err

@@ -42,8 +42,8 @@ def of_pair(number):
 
 
 @pytest.fixture
-def out(small_run, tmp_path):
-    return small_run.results(tmp_path / "out")
+def out(coarse_run, tmp_path):
+    return coarse_run.results(tmp_path / "out")
 
 
 def rejected(caplog):
@@ -54,28 +54,28 @@ def rejected(caplog):
 
 
 @pytest.mark.slow
-def test_forged_vectors_are_named_and_made_again(small_run, out, caplog):
+def test_forged_vectors_are_named_and_made_again(coarse_run, out, caplog):
     """The volumes are whole, so that only the correlation is done again."""
-    reference = small_run.out
+    reference = coarse_run.out
     forgeries = {0: doubled, 1: of_pair(2), 3: flip}
     for pair, forge in forgeries.items():
         forge(out / "vectors" / f"pair_{pair:04d}.nc")
     with pytest.raises(DamagedFile, match=r"pair_000[013]\.nc"):
         lfpiv.open_results(out).u.load()
     with pytest.raises(DamagedFile, match=r"pair_0000\.nc.*Run `lfpiv run`, which makes it again"):
-        pipeline.report(small_run.experiment, out)
+        pipeline.report(coarse_run.experiment, out)
     caplog.clear()
     with caplog.at_level("INFO", "lfpiv"):
-        summary = pipeline.correlate(small_run.experiment, out)
+        summary = pipeline.correlate(coarse_run.experiment, out)
     assert rejected(caplog) == [f"pair_{pair:04d}.nc" for pair in forgeries]
     assert len(summary["pairs"]) == PAIRS and not summary["failed"]
     assert same_vectors(out, reference) == PAIRS
     caplog.clear()
-    assert len(pipeline.correlate(small_run.experiment, out)["pairs"]) == PAIRS
+    assert len(pipeline.correlate(coarse_run.experiment, out)["pairs"]) == PAIRS
     assert not rejected(caplog)
 
 
-def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, caplog):
+def test_volumes_of_other_pairs_and_frames_are_not_correlated(coarse_run, out, caplog):
     shutil.rmtree(out / "vectors")
     volumes = out / "volumes"
     shutil.copy2(volumes / "pair_0000_b.nc", volumes / "pair_0000_a.nc")
@@ -83,20 +83,20 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(small_run, out, ca
     change("intensity", lambda values: 0 * values)(volumes / "pair_0002_b.nc")
     shutil.copy2(volumes / "pair_0003_b.nc", volumes / "pair_0003_a.nc")
     with pytest.raises(lfpiv.InputError, match="expected the two volumes"):
-        pipeline.correlate(small_run.experiment, out)
+        pipeline.correlate(coarse_run.experiment, out)
     assert rejected(caplog) == [f"pair_000{name}.nc" for name in ("0_a", "1_a", "2_b", "3_a")]
 
 
 @pytest.mark.parametrize("step", ["weights", "image pairs"])
-def test_a_folder_that_is_removed_during_the_run_ends_it(small_run, tmp_path, step):
-    out = small_run.prepared(tmp_path / "out")
+def test_a_folder_that_is_removed_during_the_run_ends_it(coarse_run, tmp_path, step):
+    out = coarse_run.prepared(tmp_path / "out")
 
     def remove(now, fraction):
         if now == step and fraction > 0:
             shutil.rmtree(out, ignore_errors=True)
 
     with pytest.raises(StorageError, match=r"out.*removed or renamed .*run the command again"):
-        pipeline.run(small_run.experiment, out, pairs=(0, 2), progress=remove)
+        pipeline.run(coarse_run.experiment, out, pairs=(0, 2), progress=remove)
 
 
 def swap_cameras(path):
@@ -115,18 +115,19 @@ def link(path):
 
 
 @pytest.mark.parametrize("forge", [swap_cameras, link, flip, cut])
-def test_a_forged_calibration_is_refused_where_it_is_not_made(small_run, out, forge):
+def test_a_forged_calibration_is_refused_where_it_is_not_made(coarse_run, out, forge):
     path = out / "calibration.h5"
     forge(path)
     for step in (pipeline.correlate, pipeline.report):
         with pytest.raises(DamagedFile, match=r"calibration\.h5.*make it again"):
-            step(small_run.experiment, out)
+            step(coarse_run.experiment, out)
     assert read_marks(path) is None
 
 
 @pytest.mark.slow
-def test_a_run_mends_a_folder_with_equal_numbers(small_run, out, caplog):
+def test_a_run_mends_a_folder_with_equal_numbers(small_run, tmp_path, caplog):
     """Calibration, background, guard layers, refinement, a volume and vectors at once."""
+    out = small_run.results(tmp_path / "out")
     for name in ("calibration.h5", "background.h5", "guard.json", "refinement.json"):
         flip(out / name)
     flip(out / "volumes" / "pair_0001_b.nc")
@@ -140,9 +141,9 @@ def test_a_run_mends_a_folder_with_equal_numbers(small_run, out, caplog):
     assert not rejected(caplog)
 
 
-def test_vectors_of_links_are_not_made_from_volumes(small_run, tmp_path):
+def test_vectors_of_links_are_not_made_from_volumes(coarse_run, tmp_path):
     """Volumes hold no linked particles."""
-    experiment, out = small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    experiment, out = coarse_run.images(tmp_path / "data"), coarse_run.results(tmp_path / "out")
     experiment.write_text(experiment.read_text("utf-8") + '\n[tracking]\nvectors = "links"\n', "utf-8")
     with pytest.raises(InputError, match=r"tracking.vectors .* Use `lfpiv run`"):
         pipeline.correlate(experiment, out)

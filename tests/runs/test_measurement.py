@@ -27,30 +27,30 @@ def assert_same(found, expected):
 
 
 @pytest.fixture(scope="module")
-def rig(small_run):
-    calibration = lfpiv.load_calibration(small_run.out / "calibration.h5")
-    return lfpiv.prepare(lfpiv.open_experiment(small_run.experiment), calibration)
+def rig(coarse_run):
+    calibration = lfpiv.load_calibration(coarse_run.out / "calibration.h5")
+    return lfpiv.prepare(lfpiv.open_experiment(coarse_run.experiment), calibration)
 
 
 @pytest.mark.slow
-def test_the_script_of_the_readme_gives_what_the_command_gives(small_run, tmp_path, monkeypatch):
-    small_run.images(tmp_path / "data")
+def test_the_script_of_the_readme_gives_what_the_command_gives(coarse_run, tmp_path, monkeypatch):
+    coarse_run.images(tmp_path / "data")
     monkeypatch.chdir(tmp_path / "data")
     names = {}
     exec(compile(script(), str(README), "exec"), names)
-    assert_same(names["vectors"], xr.load_dataset(small_run.out / "vectors" / "pair_0000.nc", engine="h5netcdf"))
+    assert_same(names["vectors"], xr.load_dataset(coarse_run.out / "vectors" / "pair_0000.nc", engine="h5netcdf"))
 
 
-def test_each_pair_and_its_volumes_are_those_of_the_run(small_run, rig):
+def test_each_pair_and_its_volumes_are_those_of_the_run(coarse_run, rig):
     seen = []
     vectors = lfpiv.measure_pair(rig, 2, progress=lambda step, fraction: seen.append(fraction))
-    stored = xr.load_dataset(small_run.out / "vectors" / "pair_0002.nc", engine="h5netcdf")
+    stored = xr.load_dataset(coarse_run.out / "vectors" / "pair_0002.nc", engine="h5netcdf")
     assert_same(vectors, stored)
     assert seen == sorted(seen) and seen[-1] == 1.0
     for name in ("dt_s", "pair", "experiment", "verdict", "settings", "passes", "valid_fraction", "warnings"):
         assert np.array_equal(vectors.attrs[name], stored.attrs[name]), name
     for frame, volume in zip("ab", rig.volumes(2), strict=True):
-        path = small_run.out / "volumes" / f"pair_0002_{frame}.nc"
+        path = coarse_run.out / "volumes" / f"pair_0002_{frame}.nc"
         assert_same(volume.to_dataset(name="intensity"), xr.load_dataset(path, engine="h5netcdf"))
 
 
@@ -75,7 +75,7 @@ def test_an_instant_of_a_series_is_measured_as_in_its_run(small_run, tmp_path, p
     assert_same(found, xr.load_dataset(out / f"vectors/instant_{FIRST + 1:06d}.nc", engine="h5netcdf"))
 
 
-def test_wrong_calls_are_refused(small_run, rig):
+def test_wrong_calls_are_refused(coarse_run, rig):
     for wrong in (4, -1, 0.5, True, "0"):
         with pytest.raises(ValueError, match="pair: expected the number of a pair, 0 to 3"):
             lfpiv.measure_pair(rig, wrong)
@@ -83,4 +83,4 @@ def test_wrong_calls_are_refused(small_run, rig):
         lfpiv.measure_pair(rig, 0, calibration=rig.calibration)
     one = lfpiv.Calibration({"left": rig.calibration.cameras["left"]})
     with pytest.raises(lfpiv.InputError, match="expected the cameras left, right"):
-        lfpiv.prepare(small_run.experiment, one)
+        lfpiv.prepare(coarse_run.experiment, one)

@@ -28,8 +28,8 @@ def with_mask(file, pattern):
 
 
 @pytest.mark.slow
-def test_volumes_are_dark_in_their_own_body_and_a_changed_mask_concerns_its_pair(small_run, tmp_path):
-    file, out = small_run.images(tmp_path / "data"), small_run.prepared(tmp_path / "out")
+def test_volumes_are_dark_in_their_own_body_and_a_changed_mask_concerns_its_pair(coarse_run, tmp_path):
+    file, out = coarse_run.images(tmp_path / "data"), coarse_run.prepared(tmp_path / "out")
     plain = read_experiment(file)
     frames = [frame for pair in (0, 1, 2, 3) for frame in plain.pair_frames(pair)]
     write_masks(plain, frames)

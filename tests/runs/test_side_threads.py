@@ -74,24 +74,24 @@ def test_results_are_written_in_order_and_errors_belong_to_their_result():
 
 
 @pytest.mark.slow
-def test_a_run_reads_ahead_and_writes_behind_with_the_same_results(small_run, tmp_path, readers, monkeypatch):
-    out = small_run.results(tmp_path / "out")
+def test_a_run_reads_ahead_and_writes_behind_with_the_same_results(coarse_run, tmp_path, readers, monkeypatch):
+    out = coarse_run.results(tmp_path / "out")
     shutil.rmtree(out / "vectors")
     shutil.rmtree(out / "volumes")
     writers, inner = set(), PairFiles.write_vectors
     monkeypatch.setattr(
         PairFiles, "write_vectors", lambda *args: writers.add(threading.current_thread().name) or inner(*args)
     )
-    summary = pipeline.run(small_run.experiment, out, keep_volumes=True)
-    assert summary["failed"] == [] and same_vectors(small_run.out, out) == PAIRS
+    summary = pipeline.run(coarse_run.experiment, out, keep_volumes=True)
+    assert summary["failed"] == [] and same_vectors(coarse_run.out, out) == PAIRS
     assert {frame.number // 2 for frame, thread in readers if thread == READER} == set(range(1, PAIRS))
     assert writers == {WRITER}
     assert len(list((out / "volumes").iterdir())) == 2 * PAIRS
 
 
 @pytest.mark.slow
-def test_a_damaged_image_fails_its_pair_and_a_full_disk_the_run_at_its_pair(small_run, tmp_path, monkeypatch):
-    file, out = small_run.images(tmp_path / "data"), small_run.calibrated(tmp_path / "out")
+def test_a_damaged_image_fails_its_pair_and_a_full_disk_the_run_at_its_pair(coarse_run, tmp_path, monkeypatch):
+    file, out = coarse_run.images(tmp_path / "data"), coarse_run.calibrated(tmp_path / "out")
     damage(sorted((file.parent / "particles").rglob("*0002*"))[0])
     inner = PairFiles.write_vectors
 

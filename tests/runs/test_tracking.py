@@ -10,18 +10,18 @@ import lfpiv
 from lfpiv.runs import frame_work, pipeline
 
 
-def with_tracking(small_run, folder, keys=""):
-    experiment = small_run.images(folder)
+def with_tracking(coarse_run, folder, keys=""):
+    experiment = coarse_run.images(folder)
     text = experiment.read_text("utf-8")
     experiment.write_text(f"{text}\n[tracking]\n{keys}", "utf-8")
     return experiment
 
 
 @pytest.mark.slow
-def test_particles_stand_beside_the_vectors_and_follow_their_settings(small_run, tmp_path, caplog, monkeypatch):
+def test_particles_stand_beside_the_vectors_and_follow_their_settings(coarse_run, tmp_path, caplog, monkeypatch):
     frames_read, read = [], frame_work.frame_light
     monkeypatch.setattr(frame_work, "frame_light", lambda *given: frames_read.append(given[3].number) or read(*given))
-    experiment, out = with_tracking(small_run, tmp_path / "data", "rounds = 2\n"), small_run.results(tmp_path / "out")
+    experiment, out = with_tracking(coarse_run, tmp_path / "data", "rounds = 2\n"), coarse_run.results(tmp_path / "out")
     shutil.rmtree(out / "volumes", ignore_errors=True)
     summary = pipeline.run(experiment, out, pairs=(0, 1))
     file = out / "particles" / "pair_0000.nc"

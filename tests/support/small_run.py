@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 import xarray as xr
 from support import scenes
 
@@ -50,7 +51,7 @@ class SmallRun:
     def prepared(self, folder: Path) -> Path:
         """Create an output folder that holds what a run measures before its first pair; return it."""
         self.calibrated(folder)
-        for name in ("background.h5", "guard.json", "refinement.json"):
+        for name in {"background.h5", "guard.json", "refinement.json"} & {path.name for path in self.out.iterdir()}:
             shutil.copy2(self.out / name, folder)
         return folder
 
@@ -83,6 +84,17 @@ def make_small_run(folder: Path, device: str) -> SmallRun:
     experiment = simulate(scene, folder / "data")
     summary = pipeline.run(experiment, folder / "out", device=device, keep_volumes=True)
     return SmallRun(experiment, folder / "out", summary)
+
+
+def make_coarse_run(small_run: SmallRun, folder: Path, device: str) -> SmallRun:
+    """Run the images and the calibration of the small run again, in voxels no finer than those of the vectors."""
+    experiment, out = small_run.images(folder / "data"), small_run.calibrated(folder / "out")
+    text = experiment.read_text("utf-8")
+    experiment.write_text(text.replace("iterations = 8", "iterations = 8\nrefinement = 1.0"), "utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out(patch.setattr)
+        summary = pipeline.run(experiment, out, device=device, keep_volumes=True)
+    return SmallRun(experiment, out, summary)
 
 
 BRIEF = """
