@@ -160,18 +160,18 @@ class Frames:
     def _out_of_order(self, first: FrameLight, second: FrameLight) -> list[Warning]:
         """Return the warnings about cameras whose first image of two stands out of order beside the one before it."""
         number, cameras = first.frame.number, self.work.cameras
-        previous = 2 * number - second.frame.number
+        step = second.frame.number - number
         for light in (first, second):
             if light.frame.number not in self.summed:
                 self.summed[light.frame.number] = summed_light(light.images, cameras)
-        self.summed = {known: found for known, found in self.summed.items() if known >= previous}
-        if previous not in self.summed:  # it failed, is none, or belongs to the work before
+        self.summed = {known: found for known, found in self.summed.items() if known >= number - 2 * step}
+        if number - step not in self.summed:  # it failed, is none, or belongs to the work before
             return []
-        before, image, after = (self.summed[known] for known in (previous, number, second.frame.number))
+        images = [found for at in range(-2, 2) if (found := self.summed.get(number + at * step)) is not None]
         return [
             Warning(code=Code.OUT_OF_ORDER, subject=name, instants=(number,))
             for name in cameras
-            if out_of_order(before[name], image[name], after[name])
+            if out_of_order(*(image[name] for image in images))
         ]
 
     def _hand_on(self, files: PairFiles, new: Sequence[HeldFrame]) -> None:

@@ -7,6 +7,7 @@ correlate at this displacement, frames of different pairs by chance.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 from scipy import fft
@@ -35,13 +36,19 @@ def summed_light(images: Mapping[str, np.ndarray], cameras: Mapping[str, Calibra
     return {name: _summed(image, round(cameras[name].optics.microimage_pitch_px)) for name, image in images.items()}
 
 
-def out_of_order(before: np.ndarray, image: np.ndarray, after: np.ndarray) -> bool:
+def out_of_order(*images: np.ndarray) -> bool:
     """Return whether the images of a camera before and after one are clearly more like each other than like it.
 
-    Particles that move on are the less alike, the more time is between two images. Images are from `summed_light`.
+    Particles that move on are the less alike, the more time is between two images. Where two lasers take turns, all
+    neighbours are unlike, so they count beside the nearest ones.
+
+    Parameters
+    ----------
+    *images : ndarray
+        Images one after the other, from `summed_light`: the last but one is judged. Three or more.
     """
-    apart = max(_unlike(before, image), _unlike(image, after))
-    return apart > OUT_OF_ORDER * _unlike(before, after)
+    apart = [_unlike(one, other) for one, other in pairwise(images)]
+    return max(apart[-2:]) > OUT_OF_ORDER * max(_unlike(images[-3], images[-1]), min(apart))
 
 
 def _unlike(one: np.ndarray, other: np.ndarray) -> float:

@@ -235,14 +235,12 @@ def test_particles_that_were_exchanged_are_noticed_and_warned_of(reference):
 
 
 def test_an_image_out_of_order_in_one_camera_is_named_with_its_instant(made, small_run, tmp_path):
-    """Instants 3 and 4 show the same particles, 5 and 6 others. With 4 and 5 exchanged, 3 is more like 5 than 4."""
+    """Instants 3 and 4 show the same particles, 5 and 6 others. With 3 in place of 6, 4 is more like 6 than 5."""
     file = write_series(small_run, tmp_path / "data")
-    first, second = (file.parent / f"run/left/{FIRST + number:05d}.tif" for number in (1, 2))
-    first.rename(tmp_path / "kept")
-    second.rename(first)
-    (tmp_path / "kept").rename(second)
+    first, last = (file.parent / f"run/left/{FIRST + number:05d}.tif" for number in (0, 3))
+    shutil.copy2(first, last)
     work = at(changed(made[1], tmp_path / "out", instants=INSTANTS), file)
     assert len(sequential(work)) == INSTANTS - 1
     marks = [provenance.read_marks(work.files(pair).vectors) for pair in work.experiment.numbers]
     found = [(one.subject, one.instants) for mark in marks for one in mark.warnings if one.code is Code.OUT_OF_ORDER]
-    assert found == [("left", (FIRST + 1,)), ("left", (FIRST + 2,))]
+    assert found == [("left", (FIRST + 2,))]

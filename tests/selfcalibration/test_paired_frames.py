@@ -16,7 +16,7 @@ def moving(count, step, noise=0.02, seed=0):
 
 
 def disorders(images):
-    return [number for number in range(1, len(images) - 1) if out_of_order(*images[number - 1 : number + 2])]
+    return [n for n in range(1, len(images) - 1) if out_of_order(*images[max(n - 2, 0) : n + 2])]
 
 
 def test_exchanged_and_repeated_images_are_told():
@@ -27,6 +27,14 @@ def test_exchanged_and_repeated_images_are_told():
         assert disorders(neighbours) == [3, 4]
         apart = [*images[:2], images[6], *images[3:6], images[2], *images[7:]]
         assert {2, 6} <= set(disorders(apart))
+
+
+def test_lasers_that_take_turns_and_light_other_particles_are_in_order():
+    weak = [0.3 * image for image in moving(12, 0.3, seed=1)]
+    turns = [
+        image + (other if at % 2 else 0) for at, (image, other) in enumerate(zip(moving(12, 0.3), weak, strict=True))
+    ]
+    assert disorders(turns) == []
 
 
 def test_light_at_rest_and_light_that_is_other_every_time_have_no_order():
