@@ -28,8 +28,8 @@ rest noise of 0.3 counts leaves 0.7, noise of a count 0.3."""
 _MEDIAN_SAMPLES = 100_000  # pixels whose median is the background
 _BRIGHT_SAMPLES, _BRIGHT = 1_000_000, 0.995  # pixels that are compared, part of them that is dimmer than the rest
 _SAME_COUNTS = 0.01  # largest difference of the same counts above backgrounds that are measured one by one
-_DIMMER = 0.5  # level from which pixels of the weaker pulse count, relative to the brightest ones
-_LOST, _LOST_BACK = 0.01, 0.03  # part of bright pixels that may lose light, and of all from `_DIMMER` on
+_DIMMER = 0.5  # level from which pixels count, relative to the brightest ones
+_LOST = 0.03  # part of these pixels that may lose light
 _LIT_SHARE = 0.04  # least share of all light in a ninth of the sensor
 _FIELDS = 4  # side of the square of fields into which a ninth is divided
 _LOST_FIELDS = 3.0  # fields that lose their light, beyond their neighbours too: more than a particle that leaves
@@ -99,8 +99,7 @@ def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.nda
         for name, light in frames[held].items():
             others = sorted(ratio for ratio in ratios.values() if 2 * ratio > ratios[name]) or [ratios[name]]
             pulses = others[(len(others) - 1) // 2]
-            share = light.kept(frames[holding][name], 1.0, _LOST)
-            back = frames[holding][name].kept(light, _DIMMER, _LOST_BACK)
+            share, back = light.kept(frames[holding][name]), frames[holding][name].kept(light)
             if share > HELD * pulses and back * pulses < ALIKE * share / pulses:
                 told.append((share / pulses, held, holding, name))
     clearest = max(told, default=(0.0, "", "", ""))[1]  # beside a camera whose light grew, others seem to lose light
@@ -126,13 +125,14 @@ class _BrightLight:
         bright = pixels[pixels >= level]
         return cls(pixels, level, float(bright.mean()) if bright.size else 0.0)
 
-    def kept(self, other: _BrightLight, level: float, lost: float) -> float:
-        """Return the share of their light that all but a part `lost` of bright pixels keep in another frame.
+    def kept(self, other: _BrightLight) -> float:
+        """Return the share of their light that all but a part `_LOST` of bright pixels keep in another frame.
 
-        Pixels count from `level` times the brightness of the brightest ones on. Without any the share is 0.
+        Pixels count from `_DIMMER` times the brightness of the brightest ones on, which may show a single particle.
+        Without any the share is 0.
         """
-        bright = self.pixels >= level * self.level
-        return float(np.quantile(other.pixels[bright] / self.pixels[bright], lost)) if bright.any() else 0.0
+        bright = self.pixels >= _DIMMER * self.level
+        return float(np.quantile(other.pixels[bright] / self.pixels[bright], _LOST)) if bright.any() else 0.0
 
 
 def _sample(image: np.ndarray) -> np.ndarray:

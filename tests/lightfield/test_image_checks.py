@@ -203,6 +203,13 @@ def test_a_frame_of_one_camera_with_both_exposures_is_told_whatever_the_pulses_h
         assert told({**first, name: both[name]}, second) == [(name, "first")]
 
 
+def test_a_bright_particle_at_rest_beside_others_that_move_is_no_second_exposure():
+    first, second = np.zeros((2, 200, 200))
+    first[90:106, 90:106] = second[90:106, 90:106] = 100.0
+    first[20:40, 20:40] = second[60:80, 20:40] = 60.0
+    assert frame_comparison.double_warnings({"left": first}, {"left": second}) == []
+
+
 @pytest.mark.parametrize("noise", [0.4, 1.0, 5.0])
 @pytest.mark.parametrize("top", [250, 4000])
 def test_an_exposure_is_told_from_another_one_of_particles_at_rest(noise, top):
