@@ -78,9 +78,9 @@ def test_two_workers_share_pairs_and_threads(planned):
 
 
 @pytest.mark.slow
-def test_tracking_is_a_step_of_the_pair(planned, small_run):
-    experiment = dataclasses.replace(read_experiment(small_run.experiment), tracking=Tracking(vectors="links"))
-    tracked = lfpiv.plan(experiment, pairs=PAIRS, out=small_run.out)
+def test_tracking_is_a_step_of_the_pair(planned, coarse_run):
+    experiment = dataclasses.replace(read_experiment(coarse_run.experiment), tracking=Tracking(vectors="links"))
+    tracked = lfpiv.plan(experiment, pairs=PAIRS, out=coarse_run.out)
     assert list(tracked.time.steps) == ["images", "reconstruction", "correlation", "tracking", "writing"]
     assert tracked.time.steps["tracking"].cpu_s > 0
     assert tracked.disk.pair > planned.disk.pair + FEW_PARTICLES
@@ -88,8 +88,8 @@ def test_tracking_is_a_step_of_the_pair(planned, small_run):
 
 
 @pytest.mark.slow
-def test_the_command_needs_neither_particle_images_nor_a_calibration(small_run, tmp_path, capfd):
-    experiment = small_run.images(tmp_path / "data")
+def test_the_command_needs_neither_particle_images_nor_a_calibration(coarse_run, tmp_path, capfd):
+    experiment = coarse_run.images(tmp_path / "data")
     for image in (experiment.parent / "particles").rglob("*.*"):
         image.unlink()
     assert commands.call(["plan", str(experiment), "--pairs", "3", "--json"]) == 0

@@ -36,7 +36,7 @@ def test_a_camera_from_above_with_another_lens_and_a_hexagonal_array_needs_no_tr
         particles={"count": 120, "sigma_mm": 0.05},
         displacement_mm=tuple(0.1 * np.array(DISPLACEMENT_VOXEL)),
         correlation={"windows": [(12, 16, 16), (12, 12, 12)]},
-        smart={"iterations": 8},
+        smart={"iterations": 8, "refinement": 1.0},
         network={"hidden": (8,), "epochs": 60},
     )
     summary = lfpiv.run(simulate(scene, tmp_path / "data"), tmp_path / "out", device=device.kind)

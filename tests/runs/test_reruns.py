@@ -25,23 +25,23 @@ def run(experiment, out, *more):
 
 
 @pytest.fixture
-def finished(small_run, tmp_path):
+def finished(coarse_run, tmp_path):
     """Return experiment file and results of a finished run, as copies."""
-    return small_run.images(tmp_path / "data"), small_run.results(tmp_path / "out")
+    return coarse_run.images(tmp_path / "data"), coarse_run.results(tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_a_lost_volume_of_an_image_pair_is_fitted_again(small_run, tmp_path, monkeypatch):
+def test_a_lost_volume_of_an_image_pair_is_fitted_again(coarse_run, tmp_path, monkeypatch):
     """The joint fit takes both frames; the volume that is there stays."""
-    out, found, pair = small_run.results(tmp_path / "out"), [], Reconstructor.pair
+    out, found, pair = coarse_run.results(tmp_path / "out"), [], Reconstructor.pair
     kept = (out / "volumes/pair_0001_a.nc").stat().st_mtime_ns
     for lost in ("volumes/pair_0001_b.nc", "vectors/pair_0001.nc"):
         (out / lost).unlink()
     monkeypatch.setattr(
         Reconstructor, "pair", lambda self, both, step: found.append(both[1].frame.label) or pair(self, both, step)
     )
-    pipeline.run(small_run.experiment, out, keep_volumes=True)
-    assert found == ["pair 1, frame b"] and same_vectors(small_run.out, out) == PAIRS
+    pipeline.run(coarse_run.experiment, out, keep_volumes=True)
+    assert found == ["pair 1, frame b"] and same_vectors(coarse_run.out, out) == PAIRS
     assert (out / "volumes/pair_0001_a.nc").stat().st_mtime_ns == kept
 
 
