@@ -208,29 +208,22 @@ def test_hostile_summaries_and_guards_are_left_out_by_name(tmp_path, text, caplo
         assert path.name in caplog.text
 
 
-def test_guard_layers_that_were_changed_are_measured_again(tmp_path, caplog):
+def test_guard_layers_and_a_refinement_that_were_changed_are_measured_again(tmp_path, caplog):
     """The digest is over all entries."""
     folder = Folder(tmp_path)
-    content = {"settings_hash": "01", "depends_on": "{}", "guard": GUARD.to_json()}
-    content = json.loads(json.dumps(content))
-    folder.guard.write_text(json.dumps(content))
-    assert guard.read(folder) is None
-    caplog.clear()
-    sealed = content | {"digest": records.digest(content)}
-    folder.guard.write_text(json.dumps(sealed))
-    assert guard.read(folder)[0] == GUARD and not caplog.text
-    folder.guard.write_text(json.dumps(sealed).replace("[0, 2]", "[0, 3]"))
-    assert guard.read(folder) is None and "digest differs" in caplog.text
-
-
-def test_a_refinement_that_was_changed_is_measured_again(tmp_path, caplog):
-    folder = Folder(tmp_path)
-    content = json.loads(json.dumps({"settings_hash": "01", "depends_on": "{}", "refinement": REFINEMENT.to_json()}))
-    sealed = json.dumps(content | {"digest": records.digest(content)})
-    folder.refinement.write_text(sealed)
-    assert refinement.read(folder)[0] == REFINEMENT and not caplog.text
-    folder.refinement.write_text(sealed.replace("1.2", "1.3"))
-    assert refinement.read(folder) is None and "digest differs" in caplog.text
+    for path, read, entry, value, old, new in (
+        (folder.guard, guard.read, "guard", GUARD, "[0, 2]", "[0, 3]"),
+        (folder.refinement, refinement.read, "refinement", REFINEMENT, "1.2", "1.3"),
+    ):
+        content = json.loads(json.dumps({"settings_hash": "01", "depends_on": "{}", entry: value.to_json()}))
+        path.write_text(json.dumps(content))
+        assert read(folder) is None
+        caplog.clear()
+        sealed = json.dumps(content | {"digest": records.digest(content)})
+        path.write_text(sealed)
+        assert read(folder)[0] == value and not caplog.text
+        path.write_text(sealed.replace(old, new))
+        assert read(folder) is None and "digest differs" in caplog.text
 
 
 # -- attributes of files -----------------------------------------------------------------------------------------------
