@@ -39,7 +39,7 @@ LEAST_FOR_NOTHING = 2
 UNLIKE_SCALES = 8.0
 """Ratio of the cameras' counts from which on the log states it: scattering angles and apertures hardly make more."""
 EXCHANGED = (128.0, 512.0)
-"""Ratios of the cameras' counts that exchanged bytes of dim images make: 256 times the ratio that they should have."""
+"""Ratios of the cameras' counts that exchanged bytes of dim images, or 8 bits, make: 256 times the right ratio."""
 NEIGHBOURS = (1, -1, 2, -2)
 """Pairs, or instants, by which a camera may be late."""
 FARTHEST = 10
@@ -156,11 +156,12 @@ def _scales_apart(light: Mapping[str, float]) -> Warning | None:
         log.info("cameras: %s; the scale of each camera is divided out", text)
         return None
     text += ", more than can be divided out"
-    log.warning("cameras: %s: store the images of both on one scale", text)
-    remedy = "Store the images of both on one scale"
+    remedy = "store the images of both on one scale"
     if EXCHANGED[0] < ratio < EXCHANGED[1]:
-        remedy = f"Look at the order of the bytes of {bright}: an exchange makes some 256 times the counts"
-    return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy})
+        remedy = f"look at the order of the bytes of {bright}, and whether its counts are shifted by 8 bits: either "
+        remedy += "makes some 256 times the counts"
+    log.warning("cameras: %s: %s", text, remedy)
+    return Warning(code=Code.MISMATCHED, figures={"found": text, "remedy": remedy[0].upper() + remedy[1:]})
 
 
 def _told(sentence: str, level: int = logging.INFO, **found: object) -> Agreement:
