@@ -20,10 +20,9 @@ import numpy as np
 from lfpiv.joint.conjugate_gradients import conjugate_gradients
 from lfpiv.joint.model import JointModel
 from lfpiv.reconstruction.image_preparation import PreparedImage
-from lfpiv.reconstruction.ordered_subsets import Subset, whole_subset
+from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.weights.operator import Weights
 from lfpiv_kernels.reconstruction.transport import Transport
-from lfpiv_kernels.transfer import to_device, to_host
 
 ROUGH = 0.3
 """Weight of the squared second differences of the nodes, in units of twice the misfit per lit pixel, as long as theirs
@@ -40,8 +39,6 @@ SECOND_DIFFERENCES = 18.0
 """Largest diagonal element of the prior: 6 of the squared second differences along each of three axes."""
 BRIGHT = 0.9
 """Share of the light whose voxels make the curvature."""
-LEAST_SUM = 0.02
-"""Least sum of the weights of a voxel that a camera sees, as a share of its largest one."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +54,7 @@ class Residual:
     misfit: float
     """SMART's misfit [counts]."""
     unlike: float
-    """How much the cameras ask for unlike light: of the mean log(I / P) of a voxel's rays, the standard deviation
-    between the cameras less the mean of all cameras, in squares, weighted by the volume; NaN where it is not asked."""
+    """How much the cameras ask for unlike light, see `unlike_light`; NaN where it is not asked."""
 
 
 @dataclass(frozen=True)
@@ -151,26 +147,15 @@ class DisplacementSteps:
 
     def _residual(self, frame: int, light: np.ndarray, transport: Transport, unlike: bool) -> Residual:
         model, prepared = self.model, self.model.frames[frame]
-        volume, equations = model.volume(frame, light, transport), prepared.equations
-        stored = model.weights.stored.store(volume)
-        with equations.locked():
-            equations.begin()
-            on_device = to_device(stored, float)
-            rays = whole_subset(len(prepared.images)).parts
-            exponents = [to_host(equations.exponent_of((one,), on_device)).copy() for one in rays]
-            misfit = equations.measured()
+        volume = model.volume(frame, light, transport)
+        exponents, misfit = prepared.exponents(volume)
         norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
-        asked = math.nan
-        if unlike:
-            gains = [one.camera_gain for one in prepared.images.values()]
-            sums = [gain * own for gain, own in zip(gains, model.weights.camera_sums, strict=True)]
-            asked = unlike_light(exponents, sums, stored)
         return Residual(
             volume=volume,
             exponent=model.sieved(model.weights.stored.restore(np.sum(exponents, axis=0))),
             relative=float(np.sqrt(misfit.squares / norm)),
             misfit=misfit.divergence,
-            unlike=asked,
+            unlike=prepared.unlike_light(exponents, volume) if unlike else math.nan,
         )
 
     def gradient(
@@ -246,16 +231,6 @@ class DisplacementSteps:
             mean = (draw * curvature(draw)).sum((1, 2, 3)) / (draw**2).sum((1, 2, 3))
             self._scale = np.maximum(mean, LEAST_CURVATURE * mean.max())[:, None, None, None]
         return self._scale
-
-
-def unlike_light(exponents: Sequence[np.ndarray], sums: Sequence[np.ndarray], volume: np.ndarray) -> float:
-    """Return how much cameras ask for unlike light, see `Residual`, from the exponents and the sums of the weights."""
-    seen = np.all([own > LEAST_SUM * own.max() for own in sums], axis=0) & (volume > 0)
-    if not seen.any():
-        return 0.0
-    asked = np.stack([one[seen] / own[seen] for one, own in zip(exponents, sums, strict=True)])
-    beyond = np.average(asked.var(axis=0, ddof=1) - asked.mean(axis=0) ** 2, weights=volume[seen])
-    return float(np.sqrt(max(beyond, 0.0)))
 
 
 def brightest(light: np.ndarray, share: float) -> np.ndarray:

@@ -246,7 +246,7 @@ def reconstruct_pair(
         Volumes as `reconstruct` returns them, with the attribute `estimate`: how they were made. After a joint fit the
         attributes `rounds`, `misfit_ratio` and `lossy` state its rounds, its misfit over that of the frames by
         themselves, and whether brightness differs between the frames, since particles are lost between them. `unlike`
-        states how much the cameras ask for unlike light (`lfpiv.joint.displacement_steps.Residual`). The last
+        states how much the cameras ask for unlike light (`lfpiv.reconstruction.unlike_light`). The last
         of `residual` and `misfit` are those of the fit, the coordinate `UNSHARED` is the volume of the frame by itself,
         and the coordinates `MOVED` of the first volume are the displacement. `joint_vectors` makes vectors of them.
 

@@ -107,6 +107,8 @@ def joint_vectors(volumes: Sequence[xr.DataArray], *, dt_s: float | None = None,
             vectors["joint"] = _flags(np.zeros(vectors["valid"].shape, bool), vectors)
         return vectors
     alone = [volume.copy(data=volume[UNSHARED].values) for volume in volumes]
+    for volume in alone:
+        volume.attrs.pop("unlike", None)  # of the fit, whose vectors count it
     vectors = correlate(*alone, dt_s=dt_s, **correlation)
     with threadpool_limits(1, "blas"):  # its sums depend on its number of threads
         return _merged(vectors, compare(vectors, volumes, alone), about).assign_attrs(about)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,10 +15,11 @@ from lfpiv.reconstruction.history import History
 from lfpiv.reconstruction.image_preparation import PreparedImage
 from lfpiv.reconstruction.momentum import Momentum
 from lfpiv.reconstruction.normalisation import LensSubsets, RowSubsets
-from lfpiv.reconstruction.ordered_subsets import Epoch, Partition, Subset, iterate_epochs
+from lfpiv.reconstruction.ordered_subsets import Epoch, Partition, Subset, iterate_epochs, whole_subset
 from lfpiv.reconstruction.result import Reconstruction, SmartStop
 from lfpiv.reconstruction.settings import SmartSettings
 from lfpiv.reconstruction.smart import ImageEquations, Misfit, State, iterate
+from lfpiv.reconstruction.unlike_light import unlike_light
 from lfpiv.weights.stored_grid import StoredGrid
 from lfpiv_kernels.reconstruction.voxels import multiply
 from lfpiv_kernels.transfer import DeviceArray, duplicate, to_device, to_host
@@ -195,6 +196,23 @@ class PreparedFrame:
         squares = sum(float(np.einsum("i,i", counts, counts, dtype=np.float64)) for counts in seen)
         light = sum(float(counts.sum(dtype=np.float64)) for counts in seen)
         return (squares / self._norm**2, light / self._light) if light > 0 else (1.0, 1.0)
+
+    def exponents(self, volume: np.ndarray) -> tuple[list[np.ndarray], Misfit]:
+        """Return the back-projected logarithms of each camera, in stored order, and the misfit, of a volume."""
+        with self.equations.locked():
+            self.equations.begin()
+            on_device = to_device(self.stored.store(volume), float)
+            rays = whole_subset(len(self.images)).parts
+            exponents = [to_host(self.equations.exponent_of((one,), on_device)).copy() for one in rays]
+            return exponents, self.equations.measured()
+
+    def unlike_light(self, exponents: Sequence[np.ndarray], volume: np.ndarray) -> float:
+        """Return how much the cameras ask for unlike light, from the exponents of a volume (z, y, x)."""
+        return unlike_light(exponents, self.normalisation.camera_sums, self.stored.store(volume))
+
+    def with_unlike_light(self, found: Reconstruction) -> Reconstruction:
+        """Return a reconstruction of the frame with how much the cameras ask for unlike light."""
+        return replace(found, unlike=self.unlike_light(self.exponents(found.volume)[0], found.volume))
 
     def _given(self, first: np.ndarray) -> DeviceArray:
         """Return the caller's first guess, shape (z, y, x), on the device, without light that no camera sees."""

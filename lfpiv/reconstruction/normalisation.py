@@ -70,14 +70,19 @@ class Normalisation:
         self.sieve = sieve
         self._weights, self._settings, self._subsets = weights, settings, subsets
         self._camera_gains = [np.float32(camera_gains[name]) for name in weights.cameras]
-        sums = zip(self._camera_gains, weights.camera_sums, strict=True)
-        self._column_sum: np.ndarray = sum(gain * own for gain, own in sums)
+        first, *others = self.camera_sums
+        self._column_sum: np.ndarray = sum(others, first)
         self._seen = self._column_sum > LEAST_COLUMN_SUM * self._column_sum.max()
         self._lit = self._seen if solid is None else self._seen & (weights.stored.store(~solid) > 0)
         self.column_sum: DeviceArray = to_device(self._column_sum, float)
         """Sum of the weights of each voxel, shape (voxel,), float32."""
         self.lit: DeviceArray = to_device(self._lit.astype(np.float32), float)
         """1 for voxels that some camera sees and that hold fluid, else 0, shape (voxel,), float32."""
+
+    @property
+    def camera_sums(self) -> list[np.ndarray]:
+        """Sums of each voxel's weights over the pixels of each camera, shape (voxel,)."""
+        return [gain * own for gain, own in zip(self._camera_gains, self._weights.camera_sums, strict=True)]
 
     @property
     def has_subsets(self) -> bool:

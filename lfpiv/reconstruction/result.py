@@ -57,6 +57,8 @@ class Reconstruction:
     intensity_cap: float
     """Limit of the counts that was used, as a multiple of the typical peak; 0 for none."""
     settings: SmartSettings
+    unlike: float | None = None
+    """How much the cameras ask for unlike light, see `lfpiv.reconstruction.unlike_light`; None if it was not asked."""
 
     @property
     def blurred(self) -> np.ndarray:
@@ -107,5 +109,6 @@ class Reconstruction:
             "normalisation": settings.normalisation,
             "accelerate": int(settings.accelerate),
             "sieve_voxel": self.sieve_voxel,
+            **({} if self.unlike is None else {"unlike": round(self.unlike, 4)}),
         }
         return xr.DataArray(self.volume, dims=AXES, coords=coordinates, name="intensity", attrs=attributes)

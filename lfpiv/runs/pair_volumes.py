@@ -120,7 +120,8 @@ class Reconstructor:
         label, start = light.frame.label, time.perf_counter()
         try:
             mask = self.solid(light.frame)
-            found = self.solver.smart.solve(light.images, floor=light.noise, mask=mask, progress=progress)
+            prepared = self.solver.smart.prepare(light.images, floor=light.noise, mask=mask)
+            found = prepared.with_unlike_light(prepared.solve(progress=progress))
         except ValueError as error:
             raise InputError(f"{label}: {error}") from error
         seconds = time.perf_counter() - start

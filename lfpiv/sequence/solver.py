@@ -237,11 +237,11 @@ class SequenceSolver:
         flow = mean_flow(flows) if flows else None
         others = {} if flow is None else _within_reach(trail, at, roughness(flow))
         if flow is None or not others:
-            return alone or own.prepared.solve(progress=progress)
+            return own.prepared.with_unlike_light(alone or own.prepared.solve(progress=progress))
         guess = agreed_guess(own.found, others, flow)
         partition = own.prepared.normalisation.correcting
         after = own.prepared.refine(guess, [partition], epochs=1, time=CORRECTING_TIME, progress=progress)
-        return own.found.continued_by(after)
+        return own.prepared.with_unlike_light(own.found.continued_by(after))
 
     def _continued(
         self, prepared: PreparedFrame, guess: np.ndarray, count: int, progress: Callable[[float], None] | None

@@ -5,6 +5,7 @@ light from beyond the volume move alike in both, so that part of the error does 
 measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
 typical size. Its variance grows with the residual, as that of a sum of independent sources does with their number.
 Where particles are smaller than voxels, most of the residual is their form. It moves as they do, so less of it counts.
+Where cameras ask for unlike light, particles are unlike bright in them, and successive volumes share what that does.
 Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one follows the
 distance of a vector from the mean of the volume.
 
@@ -23,6 +24,8 @@ RANDOM_SHARE = 5.0
 """Systematic variance over the square of the median random standard deviation, at a residual of 1."""
 POINT_SHARE = 2.0
 """The same for volumes of particles that are smaller than voxels, which are made without a sieve."""
+UNLIKE_SHARE = 400.0
+"""The same over the square of how much the cameras ask for unlike light, in volumes of a time series."""
 DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
 
@@ -30,16 +33,18 @@ DAMPING = 0.05
 def unexplained(*volumes: xr.DataArray | np.ndarray) -> float:
     """Return the systematic variance over the square of the median random standard deviation, the largest of volumes.
 
-    It is `RANDOM_SHARE` or `POINT_SHARE` times the final residual of the images, ||I - P|| / ||I||. Volumes of
-    `lfpiv.reconstruct` have it as the attribute ``residual``, one value per iteration, NaN where it was not measured;
-    the last one that was measured counts. 0 if none states it.
+    It is `RANDOM_SHARE` or `POINT_SHARE` times the final residual of the images, ||I - P|| / ||I||, and `UNLIKE_SHARE`
+    times the square of how much the cameras ask for unlike light. Volumes of `lfpiv.reconstruct` have the residual as
+    an attribute, one value per iteration, NaN where it was not measured; the last one that was measured counts. Volumes
+    of a time series have the attribute ``unlike`` as well. 0 if none states either.
     """
     shares = [0.0]
     for volume in volumes:
         if isinstance(volume, xr.DataArray) and "residual" in volume.attrs:
             share = RANDOM_SHARE if volume.attrs.get("sieve_voxel", 0.0) > 0 else POINT_SHARE
             residual = np.atleast_1d(volume.attrs["residual"]).astype(float)
-            shares.extend(share * residual[np.isfinite(residual)][-1:])
+            unlike = UNLIKE_SHARE * float(volume.attrs.get("unlike", 0.0)) ** 2
+            shares.extend(share * residual[np.isfinite(residual)][-1:] + unlike)
     return float(max(shares))
 
 

@@ -115,6 +115,21 @@ def test_an_instant_with_nothing_beside_it_is_that_of_its_images(solver, series)
     assert np.array_equal(solver.correct(done, 0).volume, alone.volume), "the flow is not known"
 
 
+@pytest.mark.slow
+def test_instants_state_how_much_their_cameras_ask_for_unlike_light(solver, series):
+    """Light that changes over one camera's image by a factor of 0.7 to 1.3 stands for particles that it sees unlike."""
+    _, images, _ = series
+    name, image = next(iter(images[0].items()))
+    uneven = images[0] | {name: image * np.linspace(0.7, 1.3, image.shape[1], dtype=np.float32)}
+    asked = []
+    for frame in (images[0], uneven):
+        done, _ = along(solver, [frame])
+        alone = solver.smart.prepare(frame)
+        asked.append(solver.correct(done, 0).unlike)
+        assert asked[-1] == pytest.approx(alone.with_unlike_light(alone.solve()).unlike, rel=TOLERANCE_F32)
+    assert 0 < 3 * asked[0] < asked[1]
+
+
 def rough_vectors():
     """Vectors of the flow that alternate along x by as much as no flow that is resolved does."""
     rough = vectors_of(FLOW)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfpiv.velocity.systematic import DAMPING, POINT_SHARE, RANDOM_SHARE, unexplained, with_systematic
+from lfpiv.velocity.systematic import DAMPING, POINT_SHARE, RANDOM_SHARE, UNLIKE_SHARE, unexplained, with_systematic
 
 ROUNDING = 1e-12
 """Float64 sums of a few terms of order one."""
@@ -62,6 +62,13 @@ def test_the_largest_final_residual_counts():
     assert unexplained(first, volume) == RANDOM_SHARE * 0.3
     assert unexplained(first.assign_attrs(residual=0.5), volume) == RANDOM_SHARE * 0.5
     assert unexplained(np.zeros((2, 2, 2)), volume) == 0.0
+
+
+def test_light_that_cameras_ask_for_counts_beside_the_residual():
+    volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6, residual=0.4)
+    asked = unexplained(volume, volume.assign_attrs(unlike=0.05))
+    assert asked == pytest.approx(RANDOM_SHARE * 0.4 + UNLIKE_SHARE * 0.05**2)
+    assert unexplained(volume.assign_attrs(unlike=0.1), volume) > asked > unexplained(volume, volume)
 
 
 def test_the_residual_of_particles_smaller_than_voxels_counts_less():
