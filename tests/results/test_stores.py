@@ -225,12 +225,10 @@ def put_pipe(path):
 
 
 @pytest.mark.slow(but="change_values-True")
-@pytest.mark.parametrize(
-    ("forge", "whole"),
-    [(change_values, True), *((forge, False) for forge in (change_values, change_interval, remove_chunk, put_pipe))],
-)
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("forge", [change_values, change_interval, remove_chunk, put_pipe])
 def test_a_forged_store_is_refused_and_written_anew(pairs, form, forge, whole, monkeypatch):
-    """Where a store is too large to read all of it, sizes, metadata and axes tell; otherwise they are compared too."""
+    """Also where a store is too large to read all of it: sizes, metadata and axes tell."""
     (path,) = lfpiv.export_results(pairs, form)
     wanted = lfpiv.open_results(path).load()
     if not whole:

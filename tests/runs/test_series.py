@@ -46,17 +46,17 @@ def made(small_run, tmp_path_factory):
 @pytest.fixture
 def solved(monkeypatch):
     """Count the reconstructions and the images that are read."""
-    counts, solve, read = Counter(), SmartSolver.solve, Experiment.frame_image
+    counts, prepare, read = Counter(), SmartSolver.prepare, Experiment.frame_image
 
-    def counted_solve(self, *arguments, **settings):
+    def counted_prepare(self, *arguments, **settings):
         counts["volumes"] += 1
-        return solve(self, *arguments, **settings)
+        return prepare(self, *arguments, **settings)
 
     def counted_read(self, name, frame):
         counts["images"] += 1
         return read(self, name, frame)
 
-    monkeypatch.setattr(SmartSolver, "solve", counted_solve)
+    monkeypatch.setattr(SmartSolver, "prepare", counted_prepare)
     monkeypatch.setattr(Experiment, "frame_image", counted_read)
     return counts
 
