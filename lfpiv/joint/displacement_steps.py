@@ -54,7 +54,7 @@ class Residual:
     misfit: float
     """SMART's misfit [counts]."""
     unlike: float
-    """How much the cameras ask for unlike light, see `unlike_light`; NaN where it is not asked."""
+    """How much the cameras ask for unlike light, see `lfpiv.reconstruction.unlike_light`; NaN where it is not asked."""
 
 
 @dataclass(frozen=True)
@@ -148,14 +148,15 @@ class DisplacementSteps:
     def _residual(self, frame: int, light: np.ndarray, transport: Transport, unlike: bool) -> Residual:
         model, prepared = self.model, self.model.frames[frame]
         volume = model.volume(frame, light, transport)
-        exponents, misfit = prepared.exponents(volume)
+        stored = model.weights.stored.store(volume)
+        exponents, misfit = prepared.exponents(stored)
         norm = sum(float(np.square(one.image, dtype=np.float64).sum()) for one in prepared.images.values())
         return Residual(
             volume=volume,
             exponent=model.sieved(model.weights.stored.restore(np.sum(exponents, axis=0))),
             relative=float(np.sqrt(misfit.squares / norm)),
             misfit=misfit.divergence,
-            unlike=prepared.unlike_light(exponents, volume) if unlike else math.nan,
+            unlike=prepared.unlike_light(exponents, stored) if unlike else math.nan,
         )
 
     def gradient(

@@ -197,22 +197,28 @@ class PreparedFrame:
         light = sum(float(counts.sum(dtype=np.float64)) for counts in seen)
         return (squares / self._norm**2, light / self._light) if light > 0 else (1.0, 1.0)
 
-    def exponents(self, volume: np.ndarray) -> tuple[list[np.ndarray], Misfit]:
-        """Return the back-projected logarithms of each camera, in stored order, and the misfit, of a volume."""
+    def exponents(self, stored: np.ndarray) -> tuple[list[np.ndarray], Misfit]:
+        """Compare a volume (voxel,) with the images: back-projected logarithms of each camera, and the misfit of all.
+
+        Volume and logarithms are in stored order.
+        """
         with self.equations.locked():
             self.equations.begin()
-            on_device = to_device(self.stored.store(volume), float)
+            on_device = to_device(stored, float)
             rays = whole_subset(len(self.images)).parts
             exponents = [to_host(self.equations.exponent_of((one,), on_device)).copy() for one in rays]
             return exponents, self.equations.measured()
 
-    def unlike_light(self, exponents: Sequence[np.ndarray], volume: np.ndarray) -> float:
-        """Return how much the cameras ask for unlike light, from the exponents of a volume (z, y, x)."""
-        return unlike_light(exponents, self.normalisation.camera_sums, self.stored.store(volume))
+    def unlike_light(self, exponents: Sequence[np.ndarray], stored: np.ndarray) -> float:
+        """Return how much the cameras ask for unlike light, from `exponents` of a volume (voxel,)."""
+        return unlike_light(exponents, self.normalisation.camera_sums, stored)
 
     def with_unlike_light(self, found: Reconstruction) -> Reconstruction:
         """Return a reconstruction of the frame with how much the cameras ask for unlike light."""
-        return replace(found, unlike=self.unlike_light(self.exponents(found.volume)[0], found.volume))
+        if len(self.images) == 1:
+            return replace(found, unlike=0.0)
+        stored = self.stored.store(found.volume)
+        return replace(found, unlike=self.unlike_light(self.exponents(stored)[0], stored))
 
     def _given(self, first: np.ndarray) -> DeviceArray:
         """Return the caller's first guess, shape (z, y, x), on the device, without light that no camera sees."""

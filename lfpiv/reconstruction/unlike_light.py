@@ -1,4 +1,4 @@
-"""How much cameras ask for unlike light: particles that are unlike bright in them, errors of their calibrations."""
+"""Measure how much cameras ask for unlike light, as they do where they see particles unlike bright."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ LEAST_SUM = 0.02
 
 
 def unlike_light(exponents: Sequence[np.ndarray], sums: Sequence[np.ndarray], volume: np.ndarray) -> float:
-    """Return how much cameras ask for unlike light.
+    """Return how much cameras ask for unlike light, a number without unit; 0 for a single camera.
 
-    A camera asks for the mean log(I / P) of a voxel's rays. The result is the standard deviation between the cameras,
-    less the mean of all cameras, in squares, weighted by the volume; 0 for a single camera.
+    A camera asks for the mean log(I / P) of a voxel's rays, I recorded and P projected. The square of the result is the
+    variance of these means between the cameras, less the square of their mean, averaged with the volume as weights.
+    Where it is negative, the result is 0.
 
     Parameters
     ----------

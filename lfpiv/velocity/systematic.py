@@ -5,7 +5,7 @@ light from beyond the volume move alike in both, so that part of the error does 
 measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
 typical size. Its variance grows with the residual, as that of a sum of independent sources does with their number.
 Where particles are smaller than voxels, most of the residual is their form. It moves as they do, so less of it counts.
-Where cameras ask for unlike light, particles are unlike bright in them, and successive volumes share what that does.
+Cameras that see particles unlike bright ask for unlike light. The errors that it makes are alike in successive volumes.
 Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one follows the
 distance of a vector from the mean of the volume.
 
@@ -25,7 +25,7 @@ RANDOM_SHARE = 5.0
 POINT_SHARE = 2.0
 """The same for volumes of particles that are smaller than voxels, which are made without a sieve."""
 UNLIKE_SHARE = 400.0
-"""The same over the square of how much the cameras ask for unlike light, in volumes of a time series."""
+"""The same over the square of the unlike light that cameras ask for, which volumes of a time series state."""
 DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
 
