@@ -82,7 +82,7 @@ class Measured:
         )
 
     @classmethod
-    def of_camera(cls, camera: CalibratedCamera) -> Measured | None:
+    def from_camera(cls, camera: CalibratedCamera) -> Measured | None:
         """Return what `as_camera` made a camera of; None for another one."""
         lens, dots, quality = camera.baseline, camera.dots, camera.report
         if lens is None or dots is None or quality is None or camera.network is not None:
@@ -97,7 +97,7 @@ def measure_or_load(
 ) -> Measured:
     """Return what the images of a camera show, from an interrupted calibration if it kept that."""
     camera = None if kept is None else kept.load(setup.name)
-    if camera is not None and (known := Measured.of_camera(camera)) is not None:
+    if camera is not None and (known := Measured.from_camera(camera)) is not None:
         log.info("%s: dots measured before, kept", setup.name)
         step(1.0)
         return known

@@ -136,7 +136,7 @@ def train(
     rng = np.random.default_rng(settings.seed)
     split = split_samples(len(inputs), parts=settings.split, groups=groups, rng=rng)
     weights = np.ones(len(inputs)) if std is None else 1 / np.asarray(std, float)
-    scaling = _Scaling.of(inputs[split.training], outputs[split.training])
+    scaling = _Scaling.from_samples(inputs[split.training], outputs[split.training])
     training, validation = (
         scaling.samples(inputs[part], outputs[part], weights[part] / _rms(weights[part]))
         for part in (split.training, split.validation)
@@ -247,7 +247,7 @@ class _Scaling:
     output_scale: np.ndarray
 
     @classmethod
-    def of(cls, inputs: np.ndarray, outputs: np.ndarray) -> _Scaling:
+    def from_samples(cls, inputs: np.ndarray, outputs: np.ndarray) -> _Scaling:
         input_centre, input_scale = _centre_and_half_range(inputs)
         output_centre, output_scale = _centre_and_half_range(outputs)
         return cls(

@@ -88,7 +88,7 @@ def _missing_images(path: Path, table: ExperimentTable) -> str:
     from lfpiv.experiment.readers.source import split
     from lfpiv.experiment.recording import Recording
 
-    recording, planes = Recording.of_table(table.particles), range(len(table.board.planes_mm))
+    recording, planes = Recording.from_table(table.particles), range(len(table.board.planes_mm))
     frames = [recording.frame(number).fields for number in recording.frames[:MOST_LOOKED_FOR]]
     groups = [[camera.white_image] for camera in table.camera]
     for pattern, fields in (

@@ -48,7 +48,7 @@ class ParticleImager:
             self._edge_mm = EDGE_SIGMA * sigma_voxel * voxel_mm
             self._steps = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
             self._light = np.where(self._steps == 0, 1 - 2 * OUTER_LIGHT, OUTER_LIGHT).prod(axis=1)
-        self._cameras = {name: (PackedCamera.of(camera), camera) for name, camera in weights.cameras.items()}
+        self._cameras = {name: (PackedCamera.from_camera(camera), camera) for name, camera in weights.cameras.items()}
         self._forms = weights.forms
 
     def __call__(self, positions_mm: np.ndarray, light: np.ndarray) -> Images:

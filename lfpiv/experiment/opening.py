@@ -80,7 +80,7 @@ def experiment_of(path: Path, table: ExperimentTable) -> Experiment:
         board=board,
         grid=grid,
         guard_mm=table.volume.guard_mm,
-        recording=Recording.of_table(particles),
+        recording=Recording.from_table(particles),
         smart=table.smart,
         self_calibration=table.self_calibration,
         bootstrap=table.bootstrap,
@@ -118,7 +118,7 @@ def check_tables(path: Path, table: ExperimentTable) -> None:
         if not table.board.mark:
             _require_orientation(path, one)
     board, particles = table.board, table.particles
-    recording = Recording.of_table(particles)
+    recording = Recording.from_table(particles)
     check_pattern(path, "board.images", board.images, {"camera": names, "plane": range(len(board.planes_mm))})
     check_pattern(path, "particles.images", particles.images, {"camera": names, **_fields(recording, particles.images)})
     if table.volume.mask is not None:

@@ -62,7 +62,7 @@ class Recording:
         return cls(pairs=instants - step, first=first, step=step, lasers=1)
 
     @classmethod
-    def of_table(cls, particles: Particles) -> Recording:
+    def from_table(cls, particles: Particles) -> Recording:
         """Return what a table ``[particles]`` states."""
         if particles.instants is None:
             return cls(pairs=particles.pairs or 0, names=particles.frames)

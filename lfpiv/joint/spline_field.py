@@ -105,7 +105,7 @@ class SplineField:
         Vectors that were replaced count little, masked ones not at all.
         """
         edges = np.asarray(vectors.attrs["voxel_mm"], float)
-        window = CorrelationSettings.of(vectors).windows[-1]
+        window = CorrelationSettings.from_vectors(vectors).windows[-1]
         means = []
         for axis, name in enumerate(AXES):
             share = window_shares(self.grid.axes_mm[axis], vectors[name].values, window[axis] * edges[axis])

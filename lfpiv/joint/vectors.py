@@ -140,7 +140,7 @@ class Evidence:
 
 def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequence[xr.DataArray]) -> Evidence:
     """Deform the frames by themselves onto each other by the fitted displacement, and correlate them once more."""
-    settings = CorrelationSettings.of(vectors)
+    settings = CorrelationSettings.from_vectors(vectors)
     window, edges = settings.windows[-1], np.asarray(vectors.attrs["voxel_mm"], float)
     moved = np.stack([volumes[0][MOVED[axis]].values for axis in AXES], -1)
     solid = solid_voxels(None, volumes[0], volumes[1], voxel_axes(volumes[0], volumes[1], None))
@@ -223,7 +223,7 @@ def _merged(vectors: xr.Dataset, evidence: Evidence, about: Mapping[str, Any]) -
     share = float(joint[valid].mean()) if valid.any() else 0.0
     return merged.assign(found).assign_attrs(
         joint_fraction=share,
-        error_correlation_voxel=error_correlation_voxel(CorrelationSettings.of(vectors).windows[-1]),
+        error_correlation_voxel=error_correlation_voxel(CorrelationSettings.from_vectors(vectors).windows[-1]),
     )
 
 

@@ -171,7 +171,7 @@ def standing_light(first: Series, second: Series | None, *, everywhere: bool = F
     decoder = first.decoder
     pooled, ratio = (None, 1.0) if second is None else _pool(first, second)
     series = [first] if second is None else [first, second]
-    parts = [_Minimum.of(one) for one in series] if pooled is None else [pooled, pooled]
+    parts = [_Minimum.from_series(one) for one in series] if pooled is None else [pooled, pooled]
     stray = [_stray(one, decoder) for one in series]
     light, region = [], np.zeros(decoder.gain.shape, bool)
     scales = [1.0] * len(series) if pooled is None else [1.0, ratio]
@@ -211,7 +211,7 @@ class _Minimum:
     noise: float
 
     @classmethod
-    def of(cls, series: Series) -> _Minimum:
+    def from_series(cls, series: Series) -> _Minimum:
         return cls(series.smallest, series.shifted, series.count, series.noise)
 
     def bias(self, decoder: LightFieldDecoder) -> np.ndarray:

@@ -90,7 +90,7 @@ def double_warnings(first: Mapping[str, np.ndarray], second: Mapping[str, np.nda
         Images of both frames, camera -> image without its dark level [counts].
     """
     frames = {
-        order: {name: _BrightLight.of(image) for name, image in images.items()}
+        order: {name: _BrightLight.from_image(image) for name, image in images.items()}
         for order, images in (("first", first), ("second", second))
     }
     told = []
@@ -119,7 +119,7 @@ class _BrightLight:
     mean: float  # of the brightest pixels, 0 without any [counts]
 
     @classmethod
-    def of(cls, image: np.ndarray) -> _BrightLight:
+    def from_image(cls, image: np.ndarray) -> _BrightLight:
         pixels = _sample(image)
         level = max(float(np.quantile(pixels, _BRIGHT)), 1e-9)
         bright = pixels[pixels >= level]

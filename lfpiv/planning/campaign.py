@@ -243,7 +243,7 @@ def _tracked(
 
     In a series the particles of its first frame are known.
     """
-    first, _ = work.fits.of(work.search, light, volumes)
+    first, _ = work.fits.of_pair(work.search, light, volumes)
     work.fits.last = (light[0].frame, first) if work.experiment.recording.is_series else None
     found, cost = _timed(lambda: work.tracked(pair, light, volumes))
     return found, cost - correlated

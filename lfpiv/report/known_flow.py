@@ -97,7 +97,7 @@ def compare(vectors: xr.Dataset, scene: Scene, pair: int) -> Comparison:
     edges = np.asarray(vectors.attrs["voxel_mm"], float)
     z, y, x = np.meshgrid(*(vectors[axis].values for axis in AXES), indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    a, b, c = np.array(CorrelationSettings.of(vectors).windows[-1][::-1]) * edges
+    a, b, c = np.array(CorrelationSettings.from_vectors(vectors).windows[-1][::-1]) * edges
     true = window_mean(scene.flow_of(pair), points, (a, b, c)) / edges
     return Comparison(vectors=vectors, true_voxel=true.T.reshape(3, *z.shape))
 

@@ -211,7 +211,7 @@ class Best:
     """Entry of the shallow network without a baseline on the paper's labels."""
 
     @classmethod
-    def of(cls, deep: Deep, shallow: Sequence[Fit]) -> Best:
+    def from_fits(cls, deep: Deep, shallow: Sequence[Fit]) -> Best:
         """Choose the best networks."""
         value, name = min(
             (max(_both(fits)), f"{trainer}, {layers} hidden layers of {NODES}")
@@ -233,7 +233,7 @@ class Best:
 
 
 def _result(deep: Deep, shallow: Sequence[Fit], labels: Mapping[str, int], sizes: Sizes) -> dict[str, Any]:
-    best = Best.of(deep, shallow)
+    best = Best.from_fits(deep, shallow)
     return page.result(
         {
             "sigma_nor": {trainer: {str(k): _both(fits) for k, fits in rows.items()} for trainer, rows in deep.items()},

@@ -42,7 +42,7 @@ class ImageState:
     """Last change of the content and of the entry in the file system [ns]."""
 
     @classmethod
-    def of(cls, source: ImagePath, start: Path) -> ImageState:
+    def from_file(cls, source: ImagePath, start: Path) -> ImageState:
         """Look at an image. `start` is the folder of the experiment file. Raise OSError if there is no such file."""
         status = source.file.stat()
         times = status.st_mtime_ns, status.st_ctime_ns
@@ -131,7 +131,7 @@ def look_at(sources: Iterable[ImagePath], start: Path, *, condensed: bool = Fals
         Store two hashes instead of an entry for each image.
     """
     try:
-        states = tuple(ImageState.of(source, start) for source in sources)
+        states = tuple(ImageState.from_file(source, start) for source in sources)
     except OSError:
         return None
     return CondensedImages(states) if condensed else Images(states)

@@ -148,7 +148,7 @@ class PairFiles:
     particles_stamp: Stamp | None = None
 
     @classmethod
-    def of(cls, experiment: Experiment, inputs: Inputs, folder: Folder, pair: int) -> PairFiles:
+    def for_pair(cls, experiment: Experiment, inputs: Inputs, folder: Folder, pair: int) -> PairFiles:
         """Return the files of a pair."""
         stamps = of_pair(experiment, inputs, pair)
         frames = experiment.pair_frames(pair)

@@ -57,7 +57,7 @@ class MovementFigures:
     rotation_std_deg: Sequence[float]
 
     @classmethod
-    def of(cls, movement: Movement) -> MovementFigures:
+    def from_movement(cls, movement: Movement) -> MovementFigures:
         """Round a movement for the summary."""
         return cls(
             shift_mm=np.round(movement.shift_mm, 5).tolist(),
@@ -142,7 +142,7 @@ def correct(
         corrections=corrections,
         disparity_before_voxel=round(before, 3),
         disparity_voxel=round(after, 3),
-        movements={name: MovementFigures.of(movement) for name, movement in found.movements.items()},
+        movements={name: MovementFigures.from_movement(movement) for name, movement in found.movements.items()},
     )
 
 

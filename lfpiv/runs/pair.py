@@ -121,7 +121,7 @@ class PairWork(FrameWork):
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(self.experiment, self.inputs, self.folder, pair)
+        return PairFiles.for_pair(self.experiment, self.inputs, self.folder, pair)
 
     def _do(self, pair: int, frames: Frames, progress: StepProgress) -> None:
         files = self.files(pair)

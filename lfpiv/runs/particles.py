@@ -36,7 +36,7 @@ class FrameFits:
     last: tuple[Frame, Fit] | None = None
     """Second frame of the last pair, and its particles found without candidates from the first frame."""
 
-    def of(self, search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
+    def of_pair(self, search: ParticleSearch, light: Sequence[FrameLight], volumes: PairVolumes) -> list[Fit]:
         """Return the particles of both frames of a pair, which the caller may change."""
         known, fits = self.last, list[Fit]()
         for frame, volume in zip(light, volumes.volumes, strict=True):
@@ -73,7 +73,7 @@ def track(
     warnings : list of Warning
         Doubts whether particles can be told apart.
     """
-    first, second = exchange(search, fits.of(search, light, volumes), vectors)
+    first, second = exchange(search, fits.of_pair(search, light, volumes), vectors)
     table = link_particles(first, second, vectors, dt_s=float(vectors.attrs["dt_s"]))
     return table, [*crowded_warnings(table, len(search.weights.cameras)), *unlinked_warnings(table)]
 

@@ -184,7 +184,7 @@ class Run:
 
     def files(self, pair: int) -> PairFiles:
         """Return the files of a pair with the stamps that they must have."""
-        return PairFiles.of(self.experiment, self.inputs, self.folder, pair)
+        return PairFiles.for_pair(self.experiment, self.inputs, self.folder, pair)
 
     def damping_stamp(self, pairs: Sequence[int]) -> Stamp:
         """Return the stamp of the damping by ghosts that was measured with some pairs."""

@@ -121,7 +121,7 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
             progress(number / len(instants))
             ends = [(instant - frame * recording.step, frame) for frame in (0, 1)]
             tables = [(read_particles(work.folder.particles(pair)), frame) for pair, frame in ends if pair in known]
-            yield instant, Candidates.of(tables, recording.step)
+            yield instant, Candidates.from_links(tables, recording.step)
 
     followed = follow(candidates(), look)
     table = track_table(followed, voxel_mm=experiment.grid.voxel_mm, dt_s=experiment.dt_s / recording.step)

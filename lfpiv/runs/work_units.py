@@ -87,7 +87,7 @@ def cut_at_segments(pending: Iterable[int], step: int) -> Iterator[WorkUnit]:
     """
     before = _Group()
     for segment, pairs in itertools.groupby(pending, segment_of):
-        group = _Group.of(segment, pairs, step)
+        group = _Group.from_pairs(segment, pairs, step)
         if before.segment + 1 == segment:
             shared = {pair for pair in before.across if pair in before.instants and pair + step in group.instants}
             before.right = group.left = shared
@@ -113,7 +113,7 @@ class _Group:
     """Boundary pairs with the segment after."""
 
     @classmethod
-    def of(cls, segment: int, pairs: Iterable[int], step: int) -> _Group:
+    def from_pairs(cls, segment: int, pairs: Iterable[int], step: int) -> _Group:
         """Sort the pairs whose first instants are in a segment."""
         group = cls(segment)
         for pair in pairs:

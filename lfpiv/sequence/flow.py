@@ -64,7 +64,7 @@ def measure_flow(
 
 def _near(first: xr.DataArray, second: xr.DataArray, correlation: Mapping[str, Any], known: xr.Dataset) -> xr.Dataset:
     """Measure the displacement in one pass, near the one that is known."""
-    checked = CheckedPair.of(first, second)
+    checked = CheckedPair.from_volumes(first, second)
     windows = windows_of(correlation["windows"], triple(first.shape))
     settings = CorrelationSettings(**{**correlation, "windows": windows})
     pair = checked.prepared(settings)

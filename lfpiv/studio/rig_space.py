@@ -29,7 +29,7 @@ class View:
     """Columns of the sensor for each of its rows."""
 
     @classmethod
-    def of(cls, table: CameraTable, shape: tuple[int, int]) -> View:
+    def from_table(cls, table: CameraTable, shape: tuple[int, int]) -> View:
         """Return the view of a camera of the experiment file, with the rows and columns of its sensor."""
         optics, camera = table.optics_of(shape), pv.Camera()
         _, up, towards = (table.orientation or Orientation(0.0)).rotation

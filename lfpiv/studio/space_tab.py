@@ -72,7 +72,7 @@ class Space:
         volume, solids = table.volume, table.volume.solid
         self.box = box = rig_space.bounds_of(volume.centre_mm, volume.size_mm)
         length = rig_space.REACH * float(np.linalg.norm(volume.size_mm))
-        views = [rig_space.View.of(camera, self._shape(camera)) for camera in table.camera]
+        views = [rig_space.View.from_table(camera, self._shape(camera)) for camera in table.camera]
         for view, camera, colour in zip(views, table.camera, itertools.cycle(COLOURS), strict=False):
             if s.s_cameras:
                 distance, place = view.camera.distance, np.asarray(view.camera.position)

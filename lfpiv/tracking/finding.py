@@ -213,7 +213,7 @@ class ParticleSearch:
 
     def particles(self, fit: Fit) -> FoundParticles:
         """Return the particles of a fit that all cameras which see them confirm, with standard errors and figures."""
-        return FoundParticles.of(self.weights.cameras, self._grid, fit)[self.reported(fit)]
+        return FoundParticles.from_fit(self.weights.cameras, self._grid, fit)[self.reported(fit)]
 
     def reported(self, fit: Fit) -> np.ndarray:
         """Return the numbers of the particles of a fit that `particles` returns."""

@@ -44,7 +44,7 @@ class Candidates:
     """Whether their link passed validation, shape (particle,), bool."""
 
     @classmethod
-    def of(cls, tables: Sequence[tuple[xr.Dataset, int]], step: int) -> Candidates:
+    def from_links(cls, tables: Sequence[tuple[xr.Dataset, int]], step: int) -> Candidates:
         """Return the particles of one instant from tables of links, each with its frame, 0 or 1, that is the instant.
 
         `step` is the number of instants between both frames.
@@ -120,7 +120,7 @@ class TrackedParticles:
         """Return the positions of some tracks, of rising numbers, one after the other."""
         rows = np.isin(self.track, tracks)
         _, number = np.unique(self.track[rows], return_inverse=True)
-        return Measured.of(
+        return Measured.from_rows(
             number, self.instant[rows].astype(float), self.positions_voxel[rows], self.errors_voxel[rows]
         )
 

@@ -58,7 +58,7 @@ class FoundParticles:
         return replace(self, **arrays)
 
     @classmethod
-    def of(cls, cameras: Mapping[str, CalibratedCamera], grid: Grid, fit: Fit) -> FoundParticles:
+    def from_fit(cls, cameras: Mapping[str, CalibratedCamera], grid: Grid, fit: Fit) -> FoundParticles:
         """Return the particles of a fit with their figures; `grid` is the volume that their density refers to."""
         model, scene, cloud = fit.model, fit.scene, fit.cloud
         if not len(cloud):

@@ -66,7 +66,7 @@ def vectors_from_links(vectors: xr.Dataset, links: xr.Dataset) -> xr.Dataset:
     )
     process = FlowProcess.fitted(places / edge, moved, error)
     centres = np.stack(np.meshgrid(*(vectors[axis].values for axis in AXES), indexing="ij"), axis=-1)[..., ::-1] / edge
-    window = CorrelationSettings.of(vectors).windows[-1]
+    window = CorrelationSettings.from_vectors(vectors).windows[-1]
     mean, deviation = process.means(centres.reshape(-1, 3), np.asarray(window[::-1], float))
     deviation *= np.maximum(np.sqrt(np.mean(np.square(process.left_out()), axis=0)), 1)
     return _merged(vectors, mean.reshape(centres.shape), deviation.reshape(centres.shape)).assign_attrs(

@@ -79,7 +79,7 @@ class ParticleImages:
 
 
 def _kernel(camera: CalibratedCamera) -> GaussianImages:
-    packed = PackedCamera.of(camera)
+    packed = PackedCamera.from_camera(camera)
     rectangles = cell_rectangles(camera.lattice.layout)
     return GaussianImages(
         packed.camera,

@@ -153,7 +153,7 @@ class Measured:
     """Number of positions of each track, shape (track,)."""
 
     @classmethod
-    def of(cls, track: np.ndarray, time: np.ndarray, position: np.ndarray, error: np.ndarray) -> Measured:
+    def from_rows(cls, track: np.ndarray, time: np.ndarray, position: np.ndarray, error: np.ndarray) -> Measured:
         """Gather rows (row,) and (row, axis) in the order of track, then time; tracks are 0, 1, ... without gaps."""
         length = np.bincount(track) if len(track) else np.zeros(0, int)
         first = np.concatenate([[0], np.cumsum(length)[:-1]]) if len(length) else length

@@ -165,7 +165,7 @@ def correlate(
     .. [1] B. Wieneke, "PIV uncertainty quantification from correlation statistics", Meas. Sci. Technol. 26 (2015)
        074002, doi:10.1088/0957-0233/26/7/074002.
     """
-    checked = CheckedPair.of(volume_a, volume_b, voxel_mm=voxel_mm, mask=mask)
+    checked = CheckedPair.from_volumes(volume_a, volume_b, voxel_mm=voxel_mm, mask=mask)
     axes, shape = checked.axes, triple(checked.values[0].shape)
     if dt_s is not None and not (is_finite(dt_s) and dt_s > 0):
         raise ValueError(f"dt_s: expected a positive time [s], got {dt_s!r}.")

@@ -39,7 +39,7 @@ class ImposedField:
     """
 
     def __init__(self, vectors: xr.Dataset, displacement: np.ndarray):
-        window = CorrelationSettings.of(vectors).windows[-1]
+        window = CorrelationSettings.from_vectors(vectors).windows[-1]
         self._voxel_mm = np.asarray(vectors.attrs["voxel_mm"], float)
         self._first_mm, dense, averages = [], displacement, []
         for number, (axis, edge, voxel_mm) in enumerate(zip(AXES, window, self._voxel_mm, strict=True)):

@@ -46,7 +46,7 @@ class CheckedPair:
     """Intensities without background, shape (z, y, x), float32."""
 
     @classmethod
-    def of(
+    def from_volumes(
         cls, first: Volume, second: Volume, *, voxel_mm: float | None = None, mask: Volume | None = None
     ) -> CheckedPair:
         """Check two volumes; arguments and exceptions as of `lfpiv.correlate`."""

@@ -47,7 +47,7 @@ class CorrelationSettings:
             raise ValueError(f"intensity_power: expected a value > 0, got {self.intensity_power!r}.")
 
     @classmethod
-    def of(cls, vectors: xr.Dataset) -> CorrelationSettings:
+    def from_vectors(cls, vectors: xr.Dataset) -> CorrelationSettings:
         """Read the settings that vectors were measured with."""
         stored = json.loads(vectors.attrs["settings"])
         return cls(**{**stored, "windows": tuple(triple(window) for window in stored["windows"])})

@@ -59,7 +59,7 @@ class PackedCamera:
     outline: np.ndarray
 
     @classmethod
-    def of(cls, camera: CalibratedCamera) -> PackedCamera:
+    def from_camera(cls, camera: CalibratedCamera) -> PackedCamera:
         """Pack a camera."""
         optics, lattice = camera.optics, camera.lattice
         basis = np.asarray(lattice.basis_mm)
@@ -134,7 +134,7 @@ def footprint_blocks(
         If there are more blocks than 32-bit indices can number, before they are computed.
     """
     shape, size = places.shape, places.size
-    packed = PackedCamera.of(camera)
+    packed = PackedCamera.from_camera(camera)
     blocks, values = sample_blocks(packed, places, form, cuts)
     require_numbers(size * blocks, places.volume_shape)
     allow(int(size * (BLOCK_BYTES * blocks + values + VOXEL_BYTES)))

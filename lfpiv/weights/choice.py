@@ -135,7 +135,7 @@ def form_errors(counted: CountedVoxels, form: str, cuts: Cuts = WHOLE) -> list[f
     if not len(counted.voxels):
         return []
     model = ray_models(counted.camera, counted.centres_mm, counted.stored.grid.voxel_mm, form)
-    blocks = blocks_of(PackedCamera.of(counted.camera), [model], form, cuts=cuts)
+    blocks = blocks_of(PackedCamera.from_camera(counted.camera), [model], form, cuts=cuts)
     return counted.errors(blocks, range(len(model)))
 
 
@@ -149,7 +149,10 @@ def choose_cuts(stored: StoredGrid, camera: CalibratedCamera) -> Cuts:
     voxels = draw_seen(stored, camera)
     if not len(voxels):
         return WHOLE
-    model, packed = ray_models(camera, stored.centres_mm(voxels), stored.grid.voxel_mm), PackedCamera.of(camera)
+    model, packed = (
+        ray_models(camera, stored.centres_mm(voxels), stored.grid.voxel_mm),
+        PackedCamera.from_camera(camera),
+    )
     finest = blocks_of(packed, [model], "pixels", cuts=CUTS[-1])
     for cuts in CUTS[:-1]:
         blocks = blocks_of(packed, [model], "pixels", cuts=cuts)

@@ -74,7 +74,7 @@ def count_voxels(
     """
     runtime.device()
     rng = np.random.default_rng(seed)
-    packed, optics = PackedCamera.of(camera), camera.optics
+    packed, optics = PackedCamera.from_camera(camera), camera.optics
     strata = np.stack(np.meshgrid(*[np.arange(points)] * 3, indexing="ij"), -1).reshape(-1, 3)
     inside = (strata + rng.random((len(centres_mm), len(strata), 3))) / points - 0.5
     objects = (np.asarray(centres_mm)[:, None] + inside * voxel_mm).reshape(-1, 3)

@@ -118,7 +118,7 @@ class Storage:
     along_x: wp.array
 
     @classmethod
-    def of(cls, plan: Plan, reach: Triple) -> Storage:
+    def from_plan(cls, plan: Plan, reach: Triple) -> Storage:
         """Return the layout for the offsets 0 to ``reach - 1`` from the plan's blocks."""
         phases = tuple(min(s, r) for s, r in zip(plan.stride, reach, strict=True))
         past = [(r - 1) // s for r, s in zip(reach, plan.stride, strict=True)]

@@ -46,11 +46,11 @@ class _Volume:
     """Mean and scale of the windows, stored by phase."""
 
     @classmethod
-    def of(cls, plan: Plan, volume: wp.array, search: Triple) -> _Volume:
+    def allocate(cls, plan: Plan, volume: wp.array, search: Triple) -> _Volume:
         """Allocate memory for a volume whose windows are measured at lags up to `search`."""
         lags = tuple(2 * r + 1 for r in search)
-        voxels = Storage.of(plan, tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True)))
-        statistics = Storage.of(plan, lags)
+        voxels = Storage.from_plan(plan, tuple(b + n - 1 for b, n in zip(plan.block, lags, strict=True)))
+        statistics = Storage.from_plan(plan, lags)
         split, sums = new_array(voxels.size), math.prod(plane_sums_shape(plan, search))
         first_sums, second_sums = new_array(sums), new_array(sums)
         mean, scale = new_array(statistics.size), new_array(statistics.size)
@@ -93,7 +93,7 @@ def make_sides(
     searches : two tuple of int
         Largest lags at which windows of each volume are measured, order (z, y, x) [voxel].
     """
-    first, second = (_Volume.of(plan, *pair) for pair in zip(volumes, searches, strict=True))
+    first, second = (_Volume.allocate(plan, *pair) for pair in zip(volumes, searches, strict=True))
     for step in zip(first.calls(plan, *moments[0]), second.calls(plan, *moments[1]), strict=True):
         launch(*(call for calls in step for call in calls))
     return first.side(), second.side()

@@ -57,7 +57,7 @@ class SpectralProducts:
     @classmethod
     def prepare(cls, plan: Plan, ring: int, plane: int) -> "SpectralProducts":
         """Allocate memory for the spectra of planes of at most `plane` elements, and for one group of lanes."""
-        spectrum = Spectrum.of(plan.block, plan.search)
+        spectrum = Spectrum.for_block(plan.block, plan.search)
         folds, folds_around = (len(quads) for quads in spectrum.folds)
         reach, half = plan.block[2] + plan.lags[2] - 1, spectrum.size[1] // 2 + 1
         wide = min(plan.stride[2], reach) * whole_groups(GROUP + _lanes_past(plan))
@@ -70,7 +70,7 @@ class SpectralProducts:
     def sum(self, first: Phased, second: Phased, layers: range, sums: wp.array) -> None:
         """Sum the products of some layers of blocks and their surroundings at every lag."""
         plan, scratch = self.plan, (self.scratch, self.scratch_pitch)
-        spectrum = Spectrum.of(plan.block, plan.search)
+        spectrum = Spectrum.for_block(plan.block, plan.search)
         transforms = zip((first, second), spectrum.planes, self.spectra, strict=True)
         calls = [
             transform_call(of, planes.transform, layers, plan.stride[0], *scratch, to) for of, planes, to in transforms

@@ -70,7 +70,7 @@ class Spectrum:
 
     @classmethod
     @functools.lru_cache
-    def of(cls, block: tuple[int, int, int], search: tuple[int, int, int]) -> Spectrum:
+    def for_block(cls, block: tuple[int, int, int], search: tuple[int, int, int]) -> Spectrum:
         """Return the transforms for a block and a search range, order (z, y, x) [voxel]."""
         size = transform_size(block[0], search[0]), transform_size(block[1], search[1])
         reach = [b + 2 * r for b, r in zip(block, search, strict=True)]
@@ -79,7 +79,7 @@ class Spectrum:
         matrices += [_back(size[1], search[1], 1.0, 1.0), _back(size[0], search[0], 1 / (size[0] * size[1]), 2.0)]
         return cls(
             size,
-            (Planes.of(block[0], size[0]), Planes.of(reach[0], size[0])),
+            (Planes.for_size(block[0], size[0]), Planes.for_size(reach[0], size[0])),
             folds,
             np.concatenate([matrix.ravel() for matrix in matrices]).astype(np.float32),
         )
@@ -112,7 +112,7 @@ class Planes:
         return transform
 
     @classmethod
-    def of(cls, count: int, size: int) -> Planes:
+    def for_size(cls, count: int, size: int) -> Planes:
         """Return the transform of `count` planes to `size` rows."""
         quads, half = fold(count, size), size // 2
         rows, counts, matrix = [], [], []

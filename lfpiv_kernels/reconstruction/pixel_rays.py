@@ -209,7 +209,7 @@ class RayMap:
         self.of_sets = tuple(_pixels(on_device, a, b, aside) for a, b in itertools.pairwise([0, *ends]))
         """For each set the rays of the pixels that see this set only."""
 
-    def of(self, number: int) -> PixelRays:
+    def rays_of(self, number: int) -> PixelRays:
         """Return the rays of the pixels that see one set only, or of all pixels for `ALL`."""
         return self.rays if number == ALL else self.of_sets[number]
 

@@ -131,5 +131,5 @@ class RayProjector:
 
     def exclusive_pixels(self, ray_set: int) -> np.ndarray:
         """Return the sensor pixels that see light by rays of one set and of no other one, shape (pixel,), int32."""
-        rays = self.map.of(ray_set)
+        rays = self.map.rays_of(ray_set)
         return self.map.pixel[rays.start : rays.end]

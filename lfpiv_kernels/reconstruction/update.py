@@ -147,7 +147,7 @@ class Comparison:
 
     def counts_of(self, ray_set: int) -> np.ndarray:
         """Return the counts of the pixels that see one set of rays only, or of all for ``ALL``, shape (pixel,)."""
-        rays = self.projector.map.of(ray_set)
+        rays = self.projector.map.rays_of(ray_set)
         return self._counts[rays.start : rays.end]
 
     def compare(self, volume: Values, totals: Totals, ray_set: int = ALL) -> None:
@@ -162,7 +162,7 @@ class Comparison:
         projector = self.projector
         projector.scatter(volume, ray_set)
         projector.darken(ray_set)
-        rays = projector.map.of(ray_set)
+        rays = projector.map.rays_of(ray_set)
         inputs = [rays, self.image, self.gain, self.floor, projector.rays]
         outputs = [projector.returned, *self._sums]
         if runtime.device().form == "gpu":

@@ -151,7 +151,7 @@ class Rehearsal:
         path = self.folder / "damping" / f"{name}.pickle"
         if not path.exists():
             vectors = self.measure(*self._light(case))
-            edge = CorrelationSettings.of(vectors).windows[-1]
+            edge = CorrelationSettings.from_vectors(vectors).windows[-1]
             exact = true_field(case, [vectors[axis].values for axis in "zyx"], edge)[..., ::-1]
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickle.dumps((vectors, exact)))

@@ -66,7 +66,7 @@ def followed(
 
     def candidates(instant: int) -> Candidates:
         frames = [(tables[pair], instant - pair) for pair in (instant, instant - 1) if 0 <= pair < len(tables)]
-        return Candidates.of(frames, 1)
+        return Candidates.from_links(frames, 1)
 
     return follow(((instant, candidates(instant)) for instant in range(len(images))), look)
 

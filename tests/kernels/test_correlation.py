@@ -146,7 +146,7 @@ def planes_twin(transform, values):
 def test_spectra_of_blocks_and_surroundings_give_their_correlation(edge, search):
     rng = np.random.default_rng(7)
     block, around = rng.normal(size=edge), rng.normal(size=edge + 2 * search)
-    spectrum = transforms.Spectrum.of((edge,) * 3, (search,) * 3)
+    spectrum = transforms.Spectrum.for_block((edge,) * 3, (search,) * 3)
     rows = [planes_twin(*of) for of in zip(spectrum.planes, (block, around), strict=True)]
     half = spectrum.size[0] // 2
     taps, near = (row[: half + 1] + 1j * np.pad(row[half + 1 :], 1) for row in rows)

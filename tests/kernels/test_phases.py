@@ -43,13 +43,13 @@ def test_voxels_and_statistics_lie_where_the_layout_says(device, shape, window, 
     moments = float(volume.mean()), float((volume.astype(float) ** 2).sum())
     _, side = make_sides(plan, [to_device(volume, float)] * 2, [moments] * 2, [(0, 0, 0), search])
 
-    voxels = Storage.of(plan, tuple(b + n - 1 for b, n in zip(plan.block, plan.lags, strict=True)))
+    voxels = Storage.from_plan(plan, tuple(b + n - 1 for b, n in zip(plan.block, plan.lags, strict=True)))
     stored = to_host(side.surroundings.values).reshape(voxels.shape)
     corner = tuple(o - r for o, r in zip(plan.origin, search, strict=True))
     for place, voxel in places(voxels, voxels.lattice(plan, corner)):
         assert stored[place] == (volume[voxel] if is_inside(voxel, shape) else 0)
 
-    statistics = Storage.of(plan, plan.lags)
+    statistics = Storage.from_plan(plan, plan.lags)
     mean, scale = (to_host(of).reshape(statistics.shape) for of in (side.statistics.mean, side.statistics.scale))
     padded = np.pad(volume.astype(float), [(r, r) for r in search])
     windows = np.lib.stride_tricks.sliding_window_view(padded, window).reshape(

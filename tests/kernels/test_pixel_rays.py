@@ -59,7 +59,7 @@ def test_pixels_that_see_one_set_are_those_of_its_map_and_others_of_none(sets):
     first, place = to_host(map_.rays.first), to_host(map_.rays.place)
     taken = []
     for number in range(sets):
-        one = map_.of(number)
+        one = map_.rays_of(number)
         pixels = map_.pixel[one.start : one.end].tolist()
         assert sorted(pixels) == [pixel for pixel, of in enumerate(seen) if of == {number}]
         assert (set_of_rays(divided)[place[first[one.start] : first[one.end]]] == number).all()
@@ -67,7 +67,7 @@ def test_pixels_that_see_one_set_are_those_of_its_map_and_others_of_none(sets):
     several = [pixel for pixel, of in enumerate(seen) if len(of) > 1]
     assert (len(several) > 0) == (sets > 1) and len(taken) > 0
     assert len(set(taken)) == len(taken) and not set(taken) & set(several)
-    whole = map_.of(ALL)
+    whole = map_.rays_of(ALL)
     assert sorted(map_.pixel[whole.start : whole.end]) == sorted(taken + several)
     np.testing.assert_array_equal(np.sort(place), np.flatnonzero((light > 0) & (rays.share > 0)))  # each ray once
     np.testing.assert_array_equal(to_host(map_.rays.dark), np.flatnonzero((light > 0) & (rays.share == 0)))

@@ -118,7 +118,7 @@ def test_pixels_of_a_gpu_are_those_of_the_cpu(lenses):
     sets = RaySets.of_lenses(microimages)
     map_ = RayMap(microimages, light, [0, microimages.size], [0], sets=sets, places=tiled.places)
     assert sorted(map_.pixel) == sorted(projector.map.pixel)
-    rays = map_.of(lenses)
+    rays = map_.rays_of(lenses)
     size = int(np.prod(microimages.sensor_shape))
     expected = projector.project(volume, np.empty(size, np.float32), lenses)
     tiled.scatter(to_device(volume, float), lenses)

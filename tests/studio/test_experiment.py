@@ -159,7 +159,7 @@ def test_cameras_see_what_they_look_at():
             "focal_length_mm": 100.0, "magnification": -1.0, "f_number": 4.0, "microlens_pitch_mm": 0.1,
             "microlens_focal_length_mm": 0.8, "pixel_um": 5.5, "name": "a", "white_image": "white.tif",
         }  # fmt: skip
-        return rig_space.View.of(CameraTable(**camera, **nominal), (2000, 1000))
+        return rig_space.View.from_table(CameraTable(**camera, **nominal), (2000, 1000))
 
     aside = view(nominal_angle_deg=30.0)
     assert np.allclose(aside.camera.position, 200 * np.array([0.5, 0, np.sqrt(0.75)]))

@@ -54,7 +54,7 @@ def followed(lost=(), wrong=None, order=None):
 
     def candidates(instant):
         ends = [(links[pair], instant - pair) for pair in (instant, instant - 1) if 0 <= pair < len(links)]
-        return Candidates.of(ends, 1)
+        return Candidates.from_links(ends, 1)
 
     return follow(((instant, candidates(instant)) for instant in range(INSTANTS)), look)
 
@@ -127,12 +127,12 @@ def test_a_particle_that_leaves_its_neighbours_is_unlike_them(clean):
 
 def test_no_particles_give_an_empty_table():
     empty = cloud(np.zeros((0, 3)))
-    found = follow(((instant, Candidates.of([], 1)) for instant in range(5)), lambda *given: empty)
+    found = follow(((instant, Candidates.from_links([], 1)) for instant in range(5)), lambda *given: empty)
     assert table_of(found).sizes["particle"] == 0
 
 
 def test_copies_of_a_candidate_are_one_and_a_valid_link_counts_first():
     links = link_particles(cloud([[0.0, 0, 0]]), cloud([[0.04, 0, 0]]), dt_s=1.0)
-    both = Candidates.of([(links.assign(valid=~links["valid"]), 0), (links, 0)], 2)
+    both = Candidates.from_links([(links.assign(valid=~links["valid"]), 0), (links, 0)], 2)
     assert both.positions_voxel == pytest.approx(np.zeros((1, 3))) and both.valid.tolist() == [True]
     assert both.moved_voxel == pytest.approx(np.array([[0.2, 0, 0]]))

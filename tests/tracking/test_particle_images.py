@@ -36,7 +36,7 @@ def dense(lists, model, camera):
 
 def test_images_equal_their_twin(rig, model):
     for number, (lists, camera) in enumerate(zip(model.lists(POINTS[:1]), rig.cameras.values(), strict=True)):
-        packed = PackedCamera.of(camera)
+        packed = PackedCamera.from_camera(camera)
         twin = reference.gaussian_image(
             camera.map,
             POINTS[0],

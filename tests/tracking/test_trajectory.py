@@ -131,5 +131,5 @@ def test_the_motion_is_found_and_a_few_outliers_do_not_change_it():
 def test_few_or_no_tracks_tell_no_motion():
     measured, _ = simulated(3, 8)
     assert fit_motion(measured, MOTION) is MOTION
-    empty = Measured.of(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    empty = Measured.from_rows(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     assert fit_motion(empty, MOTION) is MOTION and smooth(MOTION, empty).mean.size == 0

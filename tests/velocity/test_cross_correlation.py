@@ -151,7 +151,7 @@ def test_the_dataset_has_units_and_positions():
     assert float(result["z"][0]) == pytest.approx(-1.0 + 0.1 * (origin[0] + 3.5 + deform.OFFSET))
     assert float(result["x"][1] - result["x"][0]) == pytest.approx(0.4)
     settings, passes = (json.loads(result.attrs[key]) for key in ("settings", "passes"))
-    assert CorrelationSettings.of(result).windows == ((16, 16, 20), (8, 12, 8))
+    assert CorrelationSettings.from_vectors(result).windows == ((16, 16, 20), (8, 12, 8))
     assert settings["windows"] == [[16, 16, 20], [8, 12, 8]] and len(passes) == 2
     assert result.attrs["verdict"] == Verdict.GOOD.value and result.attrs["dt_s"] == 2e-4
 

@@ -86,7 +86,7 @@ def shares_matrix(shares):
 @pytest.mark.parametrize("order", [*permutations(range(3))])
 def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
     stored = StoredGrid(lfpiv.Grid(shape=(9, 7, 8), voxel_mm=0.1, first_centre_mm=(0.0, 0.0, 0.0)), order)
-    nodes = NodeGrid.of(stored, IdealCamera("one", pose), 3, lines=(True, True))
+    nodes = NodeGrid.for_camera(stored, IdealCamera("one", pose), 3, lines=(True, True))
     planes, matrix = DepthPlanes(nodes.shares), shares_matrix(nodes.shares)
     rng = np.random.default_rng(0)
     volume = rng.standard_normal(stored.size).astype(np.float32)
@@ -100,7 +100,7 @@ def test_voxels_are_shared_among_nodes_as_stated(pose, order, device):
 def test_shares_keep_light_and_lie_about_the_voxel_along_its_line_of_sight(name):
     camera, among = IdealCamera("one", (CAMERAS | BETWEEN)[name]), name in BETWEEN
     stored = StoredGrid.for_cameras(GRID, [camera])
-    nodes = NodeGrid.of(stored, camera, 4, lines=(among, among))
+    nodes = NodeGrid.for_camera(stored, camera, 4, lines=(among, among))
     assert any(nodes.lines) == among
     sight = line_of_sight(camera, GRID.centre_mm)
     for voxel in np.random.default_rng(1).choice(stored.size, 20):
@@ -137,7 +137,7 @@ def lagrange_shares(place, lines):
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0)])
 def test_models_of_nodes_are_those_of_their_places(pose, order):
     camera = IdealCamera("one", pose)
-    nodes = NodeGrid.of(StoredGrid(GRID, order), camera, 4, lines=(True, True))
+    nodes = NodeGrid.for_camera(StoredGrid(GRID, order), camera, 4, lines=(True, True))
     found = np.concatenate(list(nodes.models(camera)))
     expected = ray_models(camera, nodes.centres_mm(np.arange(nodes.size)), GRID.voxel_mm)
     radius, pitch = camera.optics.pupil_radius_mm, camera.lattice.pitch_mm
@@ -158,7 +158,7 @@ def test_images_between_nodes_are_those_of_voxels(pose, for_small_volumes):
     own = sample.own_images(stored)
     error = np.sqrt(np.mean(np.square(interpolation_errors(nodes, sample, own))))
     assert error < 1.4 * VOXEL_ERROR  # of other voxels than those by which the distance was chosen
-    wide = NodeGrid.of(stored, camera, 3 * nodes.distance)
+    wide = NodeGrid.for_camera(stored, camera, 3 * nodes.distance)
     assert np.mean(interpolation_errors(wide, sample, own)) > 2 * error
 
 

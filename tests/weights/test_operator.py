@@ -146,7 +146,7 @@ def test_footprints_of_parts_equal_the_twins_of_smaller_voxels(name, cuts):
     camera = replace(RIGS[name], optics=coarse)
     model = ray_models(camera, VOXELS_MM[1:2], VOXEL_MM)
     image = np.zeros(camera.optics.sensor_shape, np.float32)
-    add_entries(image, blocks_of(PackedCamera.of(camera), [model], "pixels", cuts=cuts), 0)
+    add_entries(image, blocks_of(PackedCamera.from_camera(camera), [model], "pixels", cuts=cuts), 0)
     twin = np.zeros(image.shape)
     edges = model[0, 12:18].reshape(3, 2), model[0, 18:30].reshape(3, 2, 2)
     for part in np.ndindex(*cuts):
@@ -250,11 +250,11 @@ def test_a_pixel_knows_its_rays(small, divided):
     ) * sets.count
     np.testing.assert_array_equal(ray_map.pixel, pixel[np.lexsort((first, own))])
     for number in range(sets.count):
-        one = ray_map.of(number)
+        one = ray_map.rays_of(number)
         np.testing.assert_array_equal(np.sort(ray_map.pixel[one.start : one.end]), pixel[own == number])
     ends = np.cumsum(np.bincount(own, minlength=sets.count)[: sets.count]).tolist()
     assert [(one.start, one.end) for one in ray_map.of_sets] == list(zip([0, *ends], ends, strict=False))
-    assert (ray_map.of(ALL).start, ray_map.of(ALL).end) == (0, len(pixel))
+    assert (ray_map.rays_of(ALL).start, ray_map.rays_of(ALL).end) == (0, len(pixel))
     counts = np.diff(found.first.numpy())
     assert found.first.numpy()[0] == 0 and counts.min() > 0
     order = np.lexsort((found.place.numpy(), np.repeat(ray_map.pixel, counts)))
@@ -367,10 +367,10 @@ def test_largest_weight_is_that_of_a_ray(small, form):
 def test_more_blocks_than_numbers_are_refused(small, monkeypatch):
     camera = small.cameras["cam1"]
     model = ray_models(camera, VOXELS_MM, VOXEL_MM)
-    blocks = len(blocks_of(PackedCamera.of(camera), [model], "profiles").ray)
+    blocks = len(blocks_of(PackedCamera.from_camera(camera), [model], "profiles").ray)
     monkeypatch.setattr(weightblocks, "MOST_BLOCKS", blocks - 1)
     with pytest.raises(ValueError, match="voxels on one camera need"):
-        blocks_of(PackedCamera.of(camera), [model], "profiles")
+        blocks_of(PackedCamera.from_camera(camera), [model], "profiles")
     with pytest.raises(ValueError, match=r"5 x 6 x 7 voxels .* blocks.*Raise volume.voxel_mm"):
         lfpiv.build_weights(IdealRig(small.cameras), small.grid, form="profiles")
 

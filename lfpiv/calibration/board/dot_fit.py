@@ -138,7 +138,7 @@ def fit_dots(
     """
     starts = iter(before if before is not None else [None] * len(expected))
     return [
-        _fit_dot(_Problem.of_dot(model, pixels, dot, signal, margin_mm), next(starts))
+        _fit_dot(_Problem.from_dot(model, pixels, dot, signal, margin_mm), next(starts))
         for plane, dots in itertools.groupby(expected, lambda dot: dot.plane)
         for signal in [pixels.signals.of_plane(plane)]
         for dot in dots
@@ -174,7 +174,7 @@ class _Problem:
     terms: np.ndarray  # `pixel_terms`, (n, TERMS + bends)
 
     @classmethod
-    def of_dot(
+    def from_dot(
         cls,
         model: LensIntegral,
         pixels: BoardPixels,

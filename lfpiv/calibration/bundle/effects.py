@@ -34,7 +34,7 @@ class Effects:
         return len(self.kind)
 
     @classmethod
-    def of(cls, board: DotBoard, dot: np.ndarray) -> Effects | None:
+    def from_dots(cls, board: DotBoard, dot: np.ndarray) -> Effects | None:
         """Return the unknowns that the dots can show; None if there are too few planes."""
         planes, sites = (np.unique(part) for part in np.divmod(dot, board.size))
         if len(planes) < LEAST_PLANES:

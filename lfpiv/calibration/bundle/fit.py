@@ -89,12 +89,12 @@ def fit_board(cameras: Sequence[CameraLabels], board: DotBoard) -> BoardErrors:
 def _fit_planes(data: Sequence[DotRays], board: DotBoard) -> BoardErrors:
     """Fit the errors of the board, linearised about the positions that are corrected so far."""
     found = _no_errors(board)
-    effects = Effects.of(board, np.concatenate([part.dot for part in data]))
+    effects = Effects.from_dots(board, np.concatenate([part.dot for part in data]))
     if effects is None:
         return found
     values = np.zeros(effects.size)
     for _ in range(PASSES):
-        equations = [Equations.of(part, effects, board, found, values) for part in data]
+        equations = [Equations.from_rays(part, effects, board, found, values) for part in data]
         known = [camera for camera in equations if camera is not None]
         if not known:
             return found
@@ -133,7 +133,7 @@ class Equations:
     least_mm: float  # lower limit of the errors that a plane's labels share [mm]
 
     @classmethod
-    def of(
+    def from_rays(
         cls, data: DotRays, effects: Effects, board: DotBoard, found: BoardErrors, values: np.ndarray
     ) -> Equations | None:
         """Linearise about the positions that are corrected by `values`; None if there are too few dots."""
@@ -170,7 +170,7 @@ class WeightedEquations:
     departure: np.ndarray  # (2, rows)
 
     @classmethod
-    def of(cls, system: Equations, noise: np.ndarray, robust: np.ndarray) -> WeightedEquations:
+    def from_equations(cls, system: Equations, noise: np.ndarray, robust: np.ndarray) -> WeightedEquations:
         """Weight by the noise of chief rays and slopes along s and t [mm], (2, 2), and the rows' robust weights."""
         roots, bases = [], []
         for along in noise.T:
@@ -206,9 +206,9 @@ def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardE
     robust = [np.ones(len(camera.variance)) for camera in equations]
     std: dict[str, float] = dict(FIRST_STD)
     for _ in range(ROUNDS):
-        weighted = [WeightedEquations.of(*camera) for camera in zip(equations, noise, robust, strict=True)]
+        weighted = [WeightedEquations.from_equations(*camera) for camera in zip(equations, noise, robust, strict=True)]
         parts = ((m, y) for camera in weighted for m, y in zip(camera.effects, camera.departure, strict=True))
-        normal = NormalEquations.of(parts, effects.kind, FIRST_STD)
+        normal = NormalEquations.from_parts(parts, effects.kind, FIRST_STD)
         std = normal.best_std(std)
         solution = normal.solve(std)
         for k, (camera, of) in enumerate(zip(equations, weighted, strict=True)):

@@ -41,7 +41,7 @@ class NormalEquations:
     """Typical standard deviation of each kind, from which a search starts."""
 
     @classmethod
-    def of(
+    def from_parts(
         cls, parts: Iterable[tuple[np.ndarray, np.ndarray]], kind: np.ndarray, typical: Mapping[str, float]
     ) -> NormalEquations:
         """Sum up parts of equations, each a matrix (rows, size) and its right side (rows,)."""

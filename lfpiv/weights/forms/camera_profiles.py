@@ -189,7 +189,7 @@ class CameraProfiles:
     @cached_property
     def profiles(self) -> Profiles:
         """The kernels' launcher for this camera."""
-        packed, radius, every = PackedCamera.of(self.camera), radius_px(self.camera), self._centres
+        packed, radius, every = PackedCamera.from_camera(self.camera), radius_px(self.camera), self._centres
         return Profiles(
             packed.camera,
             packed.lattice,

@@ -49,7 +49,7 @@ class Counted(Voxels):
 
 def counter_of(camera: CalibratedCamera, rays: int) -> tuple[CountedBlocks, Microimages]:
     """Return the kernel's launcher for a camera, and where its rays lie in memory."""
-    packed, optics = PackedCamera.of(camera), camera.optics
+    packed, optics = PackedCamera.from_camera(camera), camera.optics
     microimages = whole_microimages(optics, camera.lattice)
     constants = pack_optics(
         sensor_per_pupil=optics.sensor_per_pupil,

@@ -54,7 +54,10 @@ class Sample:
     def images(self, centres_mm: np.ndarray, voxel_mm: float, light: sparse.csr_array) -> sparse.csr_array:
         """Return sums of the images of cubes at some places with the light (group, cube), shape (group, pixel)."""
         models = ray_models(self.camera, centres_mm, voxel_mm, self.form)
-        found = light @ blocks_of(PackedCamera.of(self.camera), [models], self.form, cuts=self.cuts).pixel_weights()
+        found = (
+            light
+            @ blocks_of(PackedCamera.from_camera(self.camera), [models], self.form, cuts=self.cuts).pixel_weights()
+        )
         found.sum_duplicates()  # sorts the pixels, without which a difference takes time for each pixel of the sensor
         return found
 

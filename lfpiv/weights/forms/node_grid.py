@@ -34,7 +34,7 @@ class NodeGrid:
     """Layers from one plane to the next."""
 
     @classmethod
-    def of(
+    def for_camera(
         cls, stored: StoredGrid, camera: CalibratedCamera, distance: int, *, lines: tuple[bool, bool] = (False, False)
     ) -> NodeGrid:
         """Lay nodes along the lattice direction next to the line of sight to the middle of the grid.

@@ -139,7 +139,7 @@ def choose_nodes(
     for lines in ways:
         kept = aside[~np.array(lines)].max(initial=0)
         for distance in (one for one in DISTANCES if one * kept <= FARTHEST_ASIDE):
-            nodes = NodeGrid.of(stored, camera, distance, lines=lines)
+            nodes = NodeGrid.for_camera(stored, camera, distance, lines=lines)
             if LEAST_GAIN * nodes.size > stored.grid.size or (chosen is not None and nodes.size >= chosen.size):
                 break
             errors = interpolation_errors(nodes, sample, own)

@@ -118,10 +118,10 @@ class Voxels(Form):
 
     def _sampled(self, name: str) -> tuple[float, float]:
         """Return the mean numbers of blocks and of values of some places."""
-        packed, choice = PackedCamera.of(self.rig.cameras[name]), self.rig.choice(name)
+        packed, choice = PackedCamera.from_camera(self.rig.cameras[name]), self.rig.choice(name)
         return sample_blocks(packed, self._places(name), choice.form, choice.cuts)
 
     def _sampled_rows(self, name: str) -> float:
         """Return the mean number of rows of rays of some places."""
-        packed, choice = PackedCamera.of(self.rig.cameras[name]), self.rig.choice(name)
+        packed, choice = PackedCamera.from_camera(self.rig.cameras[name]), self.rig.choice(name)
         return sample_rows(packed, self._places(name), choice.form, choice.cuts)
