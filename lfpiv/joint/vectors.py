@@ -33,7 +33,7 @@ from lfpiv.velocity.peak_width import peak_reach, refine_search
 from lfpiv.velocity.predictor import CONTROL_SPACING, Predictor
 from lfpiv.velocity.seeding import unseeded_voxels
 from lfpiv.velocity.settings import CorrelationSettings, triple
-from lfpiv.velocity.volume_pair import missing_smoothing, preprocess, solid_voxels, voxel_axes, without
+from lfpiv.velocity.volume_pair import either, missing_smoothing, preprocess, solid_voxels, voxel_axes
 from lfpiv.velocity.windows import Windows
 from lfpiv_kernels.correlation.correlate import correlate_windows
 from lfpiv_kernels.correlation.uncertainty import displacement_deviation
@@ -149,11 +149,11 @@ def compare(vectors: xr.Dataset, volumes: Sequence[xr.DataArray], alone: Sequenc
         window_shares(volumes[0][name].values, vectors[name].values, window[axis] * edges[axis])
         for axis, name in enumerate(AXES)
     ]
-    fitted, part = _means(moved, without(solid, None if empty is None else ~empty), shares)
+    fitted, part = _means(moved, either(solid, empty), shares)
     edge = np.zeros_like(fitted)
     if empty is not None:
         smaller = ndimage.binary_erosion(empty, iterations=EDGE_VOXEL, border_value=1)
-        edge = np.abs(_means(moved, without(solid, ~smaller), shares)[0] - fitted)
+        edge = np.abs(_means(moved, either(solid, smaller), shares)[0] - fitted)
     missing = missing_smoothing(settings.smoothing_voxel, *alone)
     first, second = (
         preprocess((one.values - np.median(one.values)).astype(np.float32), missing, settings.intensity_power)

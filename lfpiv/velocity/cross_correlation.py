@@ -20,7 +20,7 @@ from lfpiv.geometry.volume import is_finite
 from lfpiv.velocity.multi_pass import Pass, correlate_passes, peak_ratio
 from lfpiv.velocity.prepared_pair import CheckedPair
 from lfpiv.velocity.settings import DEFAULTS, CorrelationSettings, triple, windows_of
-from lfpiv.velocity.systematic import unexplained, with_systematic
+from lfpiv.velocity.systematic import systematic_share, with_systematic
 from lfpiv.velocity.volume_pair import VoxelAxes, moves_beyond
 from lfpiv.warn import Code, Warning, warn
 
@@ -207,7 +207,7 @@ def correlate(
         "settings": settings.to_json(),
         "passes": json.dumps([asdict(one) for one in figures]),
     }
-    deviation = with_systematic(last.deviation(), last.field, last.valid, unexplained(volume_a, volume_b))
+    deviation = with_systematic(last.deviation(), last.field, last.valid, systematic_share(volume_a, volume_b))
     return xr.Dataset(_variables(last, deviation, axes, dt_s), _coordinates(last, axes), attributes)
 
 

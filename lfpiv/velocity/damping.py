@@ -31,7 +31,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.records import RecordError, validate
 from lfpiv.velocity.likeness import Likeness
 from lfpiv.velocity.modes import weighted
-from lfpiv.velocity.systematic import DAMPING, without_ghosts
+from lfpiv.velocity.systematic import DAMPING, variance_without_ghosts
 
 SIGNIFICANT = 2.0
 """Least distance of a slope from 1, and of an offset from 0, that is corrected [standard error]."""
@@ -236,7 +236,7 @@ class Damping:
     def _uncertainties(self, vectors: xr.Dataset, axis: str, distance: np.ndarray) -> dict[str, xr.DataArray]:
         """Return the standard deviations of an axis, of raw vectors and of those without damping."""
         found, stated = self.axes[axis], vectors[f"uncertainty_{axis}"]
-        own = np.square(found.uncertainty_factor) * without_ghosts(stated.values, distance)
+        own = np.square(found.uncertainty_factor) * variance_without_ghosts(stated.values, distance)
         offset = np.hypot(found.offset, found.offset_error)
         raw = np.sqrt(own + (found.pull * distance) ** 2 + offset**2)
         left = found.offset_error if found.used_offset else offset

@@ -22,7 +22,7 @@ from lfpiv.geometry.grid import AXES
 from lfpiv.velocity.damping import AxisDamping, Damping, displacement
 from lfpiv.velocity.likeness import UNKNOWN, Likeness, compare, octants, usable
 from lfpiv.velocity.modes import coherences, weighted
-from lfpiv.velocity.systematic import without_ghosts
+from lfpiv.velocity.systematic import variance_without_ghosts
 
 LEAST_WINDOWS = 8
 """Least number of valid windows of all simulated pairs."""
@@ -178,6 +178,6 @@ def _scaled_errors(pair: Simulated, axis: str, slope: float, offset: float) -> n
     used = used & pair.vectors["valid"].values  # others state no deviation
     rest = found - offset - mean - slope * (exact - mean)
     distance = found - (found[used].mean() if used.any() else 0.0)
-    variance = without_ghosts(pair.vectors[f"uncertainty_{axis}"].values, distance)
+    variance = variance_without_ghosts(pair.vectors[f"uncertainty_{axis}"].values, distance)
     known = used & (variance > 0)  # none after a single pass
     return np.abs(rest[known]) / np.sqrt(variance[known]) if known.any() else np.full(1, 2.0)

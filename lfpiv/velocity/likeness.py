@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv.geometry.grid import AXES
-from lfpiv.velocity.systematic import without_ghosts
+from lfpiv.velocity.systematic import variance_without_ghosts
 
 WHOLE_FLUID = 0.99
 """Least share of fluid of a window that is compared."""
@@ -121,7 +121,7 @@ def _octant_figures(vectors: xr.Dataset) -> Iterator[tuple[float, float]]:
     for axis in AXES:
         found = vectors[f"displacement_{axis}"].values
         distance = found - (found[valid].mean() if valid.any() else 0.0)
-        variance += without_ghosts(vectors[f"uncertainty_{axis}"].values, distance)
+        variance += variance_without_ghosts(vectors[f"uncertainty_{axis}"].values, distance)
     for octant in octants(used.shape):
         if (some := used & octant).any():
             known = variance[some & valid & (variance > 0)]

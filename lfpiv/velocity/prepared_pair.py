@@ -16,14 +16,14 @@ from lfpiv.velocity.settings import CorrelationSettings, triple
 from lfpiv.velocity.standing_light import on_standing_light
 from lfpiv.velocity.volume_pair import (
     VoxelAxes,
+    either,
+    float_values,
     missing_smoothing,
     normalise,
-    numbers_of,
     preprocess,
     seen_by_two,
     solid_voxels,
     voxel_axes,
-    without,
 )
 from lfpiv_kernels.correlation.memory import on_device
 from lfpiv_kernels.transfer import DeviceArray
@@ -50,16 +50,16 @@ class CheckedPair:
         cls, first: Volume, second: Volume, *, voxel_mm: float | None = None, mask: Volume | None = None
     ) -> CheckedPair:
         """Check two volumes; arguments and exceptions as of `lfpiv.correlate`."""
-        one, other = numbers_of(first, "volume_a"), numbers_of(second, "volume_b")
+        values_a, values_b = float_values(first, "volume_a"), float_values(second, "volume_b")
         axes = voxel_axes(first, second, voxel_mm)
         solid = solid_voxels(mask, first, second, axes)
-        values = normalise(one, "volume_a", solid), normalise(other, "volume_b", solid)
+        values = normalise(values_a, "volume_a", solid), normalise(values_b, "volume_b", solid)
         return cls(given=(first, second), axes=axes, solid=solid, values=values)
 
     def prepared(self, settings: CorrelationSettings) -> PreparedPair:
         """Smooth the volumes, and find what their voxels hold."""
         seen = seen_by_two(*self.given)
-        unseeded = unseeded_voxels(self.values, without(self.solid, seen))
+        unseeded = unseeded_voxels(self.values, either(self.solid, None if seen is None else ~seen))
         missing, power = missing_smoothing(settings.smoothing_voxel, *self.given), settings.intensity_power
         first, second = (preprocess(on_device(volume), missing, power) for volume in self.values)
         voxels = Voxels(seen=seen, solid=self.solid, unseeded=unseeded)

@@ -2,12 +2,12 @@
 
 Correlation statistics show what differs between two volumes. Ghosts, particles of unlike brightness in the cameras and
 light from beyond the volume move alike in both, so that part of the error does not show. The residual of the images
-measures how much of a volume is wrong. The same wrong light makes the random part, so one systematic part follows its
-typical size. Its variance grows with the residual, as that of a sum of independent sources does with their number.
-Where particles are smaller than voxels, most of the residual is their form. It moves as they do, so less of it counts.
-Cameras that see particles unlike bright ask for unlike light. The errors that it makes are alike in successive volumes.
-Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_, so another one follows the
-distance of a vector from the mean of the volume.
+measures how much of a volume is wrong. The same wrong light makes the random part. So one systematic variance is a
+share of the typical random variance. The share is proportional to the residual, as variances of independent sources
+add up. Where particles are smaller than voxels, most of the residual is their form. It moves as they do, so less of it
+counts. Cameras that see particles unlike bright ask for unlike light. Its errors are alike in successive volumes.
+Ghosts move with the mean of the particles on the lines of sight that cross in them [1]_. So another systematic part is
+proportional to the difference between a vector and the mean of the volume.
 
 References
 ----------
@@ -30,8 +30,8 @@ DAMPING = 0.05
 """Share by which ghosts pull a vector towards the mean of the volume."""
 
 
-def unexplained(*volumes: xr.DataArray | np.ndarray) -> float:
-    """Return the systematic variance over the square of the median random standard deviation, the largest of volumes.
+def systematic_share(*volumes: xr.DataArray | np.ndarray) -> float:
+    """Return the systematic variance over the square of the median random standard deviation; the largest counts.
 
     It is `RANDOM_SHARE` or `POINT_SHARE` times the final residual of the images, ||I - P|| / ||I||, and `UNLIKE_SHARE`
     times the square of how much the cameras ask for unlike light. Volumes of `lfpiv.reconstruct` have the residual as
@@ -63,7 +63,7 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, sh
     valid : ndarray of bool, shape (z, y, x)
         Vectors that were measured.
     share : float
-        From `unexplained`; 0 adds nothing.
+        From `systematic_share`; 0 adds nothing.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def with_systematic(random: np.ndarray, field: np.ndarray, valid: np.ndarray, sh
     return np.sqrt(random**2 + systematic)
 
 
-def without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def variance_without_ghosts(stated: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Return the variances of stated standard deviations without the assumed share of ghosts [voxel^2].
 
     Parameters

@@ -21,7 +21,7 @@ CLEAR_SHARE = 2.0
 CLEAR_SIGMA = 8.0
 """Smallest clear peak beyond the searched lags, as a multiple of the standard deviation over all lags."""
 
-_BACKGROUND_SAMPLES = 100_000  # voxels whose median is the background
+_BACKGROUND_SAMPLES = 100_000  # voxels that are sampled for the background, their median
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class VoxelAxes:
         return self.spacing if self.unit == "mm" else None
 
 
-def numbers_of(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
+def float_values(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
     """Return the values of a volume as float32, NaN where masked; raise ValueError if it is not three-dimensional."""
     try:
         values = np.asarray(volume)
@@ -80,7 +80,7 @@ def normalise(values: np.ndarray, name: str, solid: np.ndarray | None = None) ->
 
 
 def _median(values: np.ndarray) -> np.floating:
-    """Return what `numpy.median` does of finite numbers, in a quarter of its time: it sorts about one place."""
+    """Return the median of finite numbers, as `numpy.median` does. A partial sort takes a quarter of the time."""
     half = values.size // 2
     parted = np.partition(values, half)
     upper: np.floating = parted[half]
@@ -186,23 +186,23 @@ def solid_voxels(
     return solid if solid.any() else None
 
 
-def without(solid: np.ndarray | None, seen: np.ndarray | None) -> np.ndarray | None:
-    """Return the flags of the voxels that are solid or not seen, shape (z, y, x); None if there are none."""
-    if seen is None:
-        return solid
-    return ~seen if solid is None else solid | ~seen
+def either(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
+    """Return the union of two flags of voxels, shape (z, y, x); None flags no voxel."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first | second
 
 
 def moves_beyond(first: Values, second: Values, search: tuple[int, int, int]) -> bool:
-    """Return whether two volumes (z, y, x) as a whole clearly correlate at larger lags than `search` reaches.
+    """Return whether two volumes (z, y, x) as a whole clearly correlate at lags beyond `search` (z, y, x) [voxel].
 
     The central blocks of both volumes are correlated with wrap-around, on the host.
     """
     middle = tuple(slice(max(n - LARGEST_BLOCK, 0) // 2, (n + min(n, LARGEST_BLOCK)) // 2) for n in first.shape)
-    one, other = (to_host(volume[middle]) for volume in (first, second))
-    spectrum, other = (fft.rfftn(block - block.mean()) for block in (one, other))
-    shape = one.shape
-    correlation = fft.irfftn(spectrum.conj() * other, shape)
+    blocks = [to_host(volume[middle]) for volume in (first, second)]
+    shape = blocks[0].shape
+    spectrum_a, spectrum_b = (fft.rfftn(block - block.mean()) for block in blocks)
+    correlation = fft.irfftn(spectrum_a.conj() * spectrum_b, shape)
     lags = np.meshgrid(*(np.abs(n * fft.fftfreq(n)) for n in shape), indexing="ij", sparse=True)
     near = np.logical_and.reduce(np.broadcast_arrays(*(lag <= reach for lag, reach in zip(lags, search, strict=True))))
     if near.all():

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lfpiv.velocity.systematic import DAMPING, POINT_SHARE, RANDOM_SHARE, UNLIKE_SHARE, unexplained, with_systematic
+from lfpiv.velocity.systematic import (
+    DAMPING,
+    POINT_SHARE,
+    RANDOM_SHARE,
+    UNLIKE_SHARE,
+    systematic_share,
+    with_systematic,
+)
 
 ROUNDING = 1e-12
 """Float64 sums of a few terms of order one."""
@@ -58,27 +65,27 @@ def test_replaced_vectors_are_no_neighbours():
 def test_the_largest_final_residual_counts():
     volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6)
     first, second = volume.assign_attrs(residual=[0.9, 0.3]), volume.assign_attrs(residual=np.array([0.8, 0.4]))
-    assert unexplained(first, second) == unexplained(second, first) == RANDOM_SHARE * 0.4
-    assert unexplained(first, volume) == RANDOM_SHARE * 0.3
-    assert unexplained(first.assign_attrs(residual=0.5), volume) == RANDOM_SHARE * 0.5
-    assert unexplained(np.zeros((2, 2, 2)), volume) == 0.0
+    assert systematic_share(first, second) == systematic_share(second, first) == RANDOM_SHARE * 0.4
+    assert systematic_share(first, volume) == RANDOM_SHARE * 0.3
+    assert systematic_share(first.assign_attrs(residual=0.5), volume) == RANDOM_SHARE * 0.5
+    assert systematic_share(np.zeros((2, 2, 2)), volume) == 0.0
 
 
 def test_light_that_cameras_ask_for_counts_beside_the_residual():
     volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6, residual=0.4)
-    asked = unexplained(volume, volume.assign_attrs(unlike=0.05))
+    asked = systematic_share(volume, volume.assign_attrs(unlike=0.05))
     assert asked == pytest.approx(RANDOM_SHARE * 0.4 + UNLIKE_SHARE * 0.05**2)
-    assert unexplained(volume.assign_attrs(unlike=0.1), volume) > asked > unexplained(volume, volume)
+    assert systematic_share(volume.assign_attrs(unlike=0.1), volume) > asked > systematic_share(volume, volume)
 
 
 def test_the_residual_of_particles_smaller_than_voxels_counts_less():
     volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(residual=0.4)
     points, blobs = (volume.assign_attrs(sieve_voxel=sieve) for sieve in (0.0, 0.6))
-    assert unexplained(points, points) == unexplained(volume, volume) == POINT_SHARE * 0.4
-    assert unexplained(blobs, blobs) > unexplained(points, points) > 0
+    assert systematic_share(points, points) == systematic_share(volume, volume) == POINT_SHARE * 0.4
+    assert systematic_share(blobs, blobs) > systematic_share(points, points) > 0
 
 
 def test_a_residual_that_was_not_measured_counts_as_the_one_before():
     volume = xr.DataArray(np.zeros((2, 2, 2)), dims=("z", "y", "x")).assign_attrs(sieve_voxel=0.6)
-    assert unexplained(volume.assign_attrs(residual=[0.9, 0.3, np.nan])) == pytest.approx(0.3 * RANDOM_SHARE)
-    assert unexplained(volume.assign_attrs(residual=[np.nan])) == 0
+    assert systematic_share(volume.assign_attrs(residual=[0.9, 0.3, np.nan])) == pytest.approx(0.3 * RANDOM_SHARE)
+    assert systematic_share(volume.assign_attrs(residual=[np.nan])) == 0
