@@ -9,7 +9,7 @@ import numpy as np
 from lfpiv.geometry.volume import in_order
 from lfpiv.reconstruction.ordered_subsets import Subset
 from lfpiv.weights.stored_grid import StoredGrid
-from lfpiv_kernels.reconstruction.first_guess import add_logarithms, exponentiate, give_light
+from lfpiv_kernels.reconstruction.first_guess import add_logarithms, exponentiate, scale_to_images
 from lfpiv_kernels.reconstruction.pixel_rays import ALL
 from lfpiv_kernels.reconstruction.update import Comparison
 from lfpiv_kernels.transfer import DeviceArray, zeros
@@ -59,7 +59,7 @@ def multiplicative_guess(
         sets = [ALL] if subset is None else subset.sets_of(number)
         add_logarithms(comparison, max(comparison.floor, LEAST_FLOOR_SHARE * peak), logarithm, sets)
     guess = exponentiate(logarithm, column_sum if sums is None else sums, lit, FAINTEST)
-    give_light(guess, column_sum, comparisons, shown)
+    scale_to_images(guess, column_sum, comparisons, shown)
     return guess
 
 

@@ -28,13 +28,13 @@ def power(volumes: Sequence[Values]) -> float:
 
 
 def lag_products(volumes: Sequence[Values], lag: int, axes: Sequence[int]) -> list[float]:
-    """Return the sum over all volumes of products of voxels that lie `lag` apart along each of some axes."""
+    """Return the sum over all volumes of products of voxels `lag` [voxel] apart along each of some axes."""
     if runtime.device().form == "gpu":
         return sums_gpu.lag_products([on_device(volume) for volume in volumes], lag, axes).sum(0).tolist()
     return [sum(_product(to_host(volume), axis, lag) for volume in volumes) for axis in axes]
 
 
 def _product(values: np.ndarray, axis: int, lag: int) -> float:
-    """Return the sum of products of voxels that lie `lag` apart along an axis."""
+    """Return the sum of products of voxels `lag` [voxel] apart along an axis."""
     moved = np.moveaxis(values, axis, 0)
     return float((moved[lag:] * moved[:-lag]).sum(dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Sums over all voxels of a volume on a GPU, in an order that does not change; in double precision."""
+"""Sums over all voxels of a volume on a GPU, in double precision and a fixed order."""
 
 from collections.abc import Sequence
 
@@ -13,19 +13,19 @@ from lfpiv_kernels.transfer import to_host
 wp.set_module_options(native.quiet_options() | {"max_unroll": 0})
 
 PARTS = (1 << 17, 1 << 9, 1)
-"""Threads that add up voxels, those that add up what they found, and so on to the sum. Each adds up what lies at the
-distance of their number: neighbouring threads read neighbouring values."""
+"""Threads of each stage of a sum. A thread of a stage with n threads adds up every n-th value of the stage before, so
+that neighbouring threads read neighbouring values."""
 
 
 @wp.kernel
 def _sum_products(
     # in
-    one: wp.array(dtype=float),  # flat; a thread per part of the sum
+    one: wp.array(dtype=float),  # flat volume; a thread per part of the sum
     other: wp.array(dtype=float),
-    extent: wp.int64,  # consecutive places that have a partner
-    period: wp.int64,  # voxels after which such places begin again
-    distance: wp.int64,  # of the partner [voxel]
-    places: wp.int64,
+    extent: wp.int64,  # consecutive voxels that have a partner
+    period: wp.int64,  # elements from the first of them to the next first
+    distance: wp.int64,  # of the partner in memory [elements]
+    places: wp.int64,  # voxels that have a partner
     threads: int,
     begin: int,
     # out
@@ -44,8 +44,8 @@ def _sum_products(
 @wp.kernel
 def _sum_values(
     # in
-    values: wp.array(dtype=float),  # flat; a thread per part of the sum
-    places: wp.int64,
+    values: wp.array(dtype=float),  # flat volume; a thread per part of the sum
+    places: wp.int64,  # voxels
     threads: int,
     begin: int,
     # out
@@ -63,10 +63,10 @@ def _sum_values(
 @wp.kernel
 def _add_parts(
     # in
-    part: wp.array2d(dtype=wp.float64),  # (sum, part)
+    part: wp.array2d(dtype=wp.float64),  # (sum, part of the stage before)
     begin: int,
     # out
-    sum_out: wp.array2d(dtype=wp.float64),  # (sum, part): fewer parts
+    sum_out: wp.array2d(dtype=wp.float64),  # (sum, part)
 ):
     row, column = wp.tid()
     row += begin
@@ -87,7 +87,7 @@ def moments(volumes: Sequence[wp.array]) -> np.ndarray:
 
 
 def lag_products(volumes: Sequence[wp.array], lag: int, axes: Sequence[int]) -> np.ndarray:
-    """Return the sum of products of voxels that lie `lag` apart, shape (volume, axis), float64."""
+    """Return the sum of products of voxels `lag` [voxel] apart along some axes, shape (volume, axis), float64."""
     calls = []
     for volume in volumes:
         flat = volume.flatten()
@@ -100,10 +100,10 @@ def lag_products(volumes: Sequence[wp.array], lag: int, axes: Sequence[int]) -> 
 
 
 def _add_up(calls: Sequence[tuple[wp.Kernel, list[object]]]) -> np.ndarray:
-    """Return what kernels sum; their inputs are given up to the number of places."""
+    """Return the sums of kernels, shape (call,), float64. Calls state their inputs up to the number of places."""
     threads, *fewer = PARTS
     parts = empty_volume((len(calls), threads), wp.float64)
-    launch(*(Call(kernel, threads, [*of, threads], [parts[k]]) for k, (kernel, of) in enumerate(calls)))
+    launch(*(Call(kernel, threads, [*inputs, threads], [parts[k]]) for k, (kernel, inputs) in enumerate(calls)))
     for count in fewer:
         sums = empty_volume((len(calls), count), wp.float64)
         launch(Call(_add_parts, len(calls), [parts], [sums], inner=(count,)))

@@ -1,6 +1,7 @@
-"""SMART's first guess on the device: exp(sum_i w log(1 + I / b) / sum_i w) - 1, and its light beside the images'.
+"""SMART's first guess on the device: exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled to the light of the images.
 
-Logarithms and exponentials are NumPy's on the CPU, where they are vectors, and Warp's on a GPU: twins of each other.
+On the CPU NumPy computes logarithms and exponentials, because it vectorises them; on a GPU Warp does. Each is the twin
+of the other.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from lfpiv_kernels.transfer import empty, to_device, to_host
 wp.set_module_options(native.quiet_options())
 
 FEWEST_PIXELS = 8192
-"""Pixels of a part of the logarithms on the CPU."""
+"""Least number of pixels whose logarithms a thread of the CPU takes."""
 SMALL = 1e-3
 """Below this log(1 + x) and exp(x) - 1 are series, since 1 + x loses digits of x."""
 
@@ -41,10 +42,10 @@ def _expm1(x: float):
 @wp.kernel
 def _logarithm(
     # in
-    pixel: wp.array(dtype=int),
-    image: wp.array(dtype=float),
-    gain: wp.array(dtype=float),
-    floor: float,
+    pixel: wp.array(dtype=int),  # of the sensor, per lit pixel
+    image: wp.array(dtype=float),  # per lit pixel [counts]
+    gain: wp.array(dtype=float),  # per lit pixel
+    floor: float,  # [counts]
     first_pixel: int,
     # out
     logarithm_out: wp.array(dtype=float),  # per pixel of the sensor
@@ -67,11 +68,11 @@ def _exponentiate(
 
 
 @wp.kernel
-def _lift(
+def _raise_to_faintest(
     # in
     lit: wp.array(dtype=float),
-    largest: wp.array(dtype=float),
-    faintest: float,
+    largest: wp.array(dtype=float),  # largest value of the guess, (1,)
+    faintest: float,  # least value of lit voxels over the largest
     first_voxel: int,
     # out
     guess_out: wp.array(dtype=float),
@@ -81,7 +82,7 @@ def _lift(
 
 
 @wp.kernel
-def _multiply_light(
+def _multiply_as_doubles(
     # in
     one: wp.array(dtype=float),
     other: wp.array(dtype=float),
@@ -96,7 +97,7 @@ def _multiply_light(
 @wp.kernel
 def _rescale(
     # in
-    totals: wp.array(dtype=wp.float64),
+    totals: wp.array(dtype=wp.float64),  # light of the images, and of the guess's projections
     first_voxel: int,
     # out
     guess_out: wp.array(dtype=float),
@@ -106,7 +107,10 @@ def _rescale(
 
 
 def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets: Sequence[int]) -> None:
-    """Add the back projection of gain * log(1 + image / floor) by sets of rays to `out`, shape (voxel,)."""
+    """Add the back projection of gain * log(1 + image / floor) by sets of rays to `out`, shape (voxel,).
+
+    `floor` is in counts.
+    """
     image = empty(comparison.size)
     pixel = comparison.projector.map.rays.pixel
     if runtime.device().form == "cpu":
@@ -123,25 +127,25 @@ def add_logarithms(comparison: Comparison, floor: float, out: wp.array, ray_sets
 
 
 def exponentiate(logarithm: wp.array, column_sum: wp.array, lit: wp.array, faintest: float) -> wp.array:
-    """Overwrite `logarithm` by exp(logarithm / column_sum) - 1, at least `faintest` of the largest; 0 where not lit.
+    """Return exp(logarithm / column_sum) - 1, at least `faintest` of the largest, shape (voxel,); 0 where not lit.
 
-    Return it.
+    A GPU overwrites `logarithm` by it.
     """
     if runtime.device().form == "cpu":
         total, where = to_host(column_sum), to_host(lit) > 0
         guess = np.expm1(np.divide(to_host(logarithm), total, out=np.zeros_like(total), where=where))
         return to_device(np.where(where, np.maximum(guess, faintest * guess.max()), np.float32(0)), float)
     sweep(_exponentiate, lit.size, [column_sum, lit], [logarithm])
-    sweep(_lift, lit.size, [lit, sums.largest(logarithm), float(faintest)], [logarithm])
+    sweep(_raise_to_faintest, lit.size, [lit, sums.largest(logarithm), float(faintest)], [logarithm])
     return logarithm
 
 
-def give_light(
+def scale_to_images(
     guess: wp.array, column_sum: wp.array, comparisons: Sequence[Comparison], shown: Sequence[wp.array]
 ) -> None:
     """Scale a volume so that its projections have the light of the images where it lights them.
 
-    The light of its projections is the sum of guess * column_sum: nothing is projected.
+    The light of all its projections is the sum of guess * column_sum, so nothing is projected.
 
     Parameters
     ----------
@@ -160,5 +164,5 @@ def give_light(
 def _add_product(totals: Totals, place: int, one: wp.array, other: wp.array) -> None:
     """Add the sum of one * other to the total at `place`."""
     product = empty(one.size, wp.float64)
-    launch(Call(_multiply_light, one.size, [one, other], [product]), parts=parts_of(one.size, FEWEST_VOXELS))
+    launch(Call(_multiply_as_doubles, one.size, [one, other], [product]), parts=parts_of(one.size, FEWEST_VOXELS))
     totals.add(place, product)

@@ -1,8 +1,9 @@
 """Warp: sums and largest values of arrays on the device, whose results stay there until they are read.
 
-Orders are fixed, so that no result depends on the number of threads. On the CPU a thread sums neighbours, and NumPy
-sums what the threads found. On a GPU each of `LANES` threads sums every `LANES`-th element, so that neighbouring
-threads read neighbours; `GROUPS` threads sum what these found, and one thread the rest. Twins: NumPy's sums.
+Elements are summed in a fixed order, so that no result depends on the number of threads. On the CPU a thread sums
+neighbours, and NumPy adds up the threads' sums. On a GPU each of `LANES` threads sums every `LANES`-th element, so that
+neighbouring threads read neighbours. Then `GROUPS` threads sum these sums, and a single thread theirs. Twins: NumPy's
+sums.
 """
 
 import numpy as np
@@ -16,26 +17,26 @@ from lfpiv_kernels.transfer import empty, to_device, to_host, zeros
 wp.set_module_options(native.options("voxels.h"))
 
 LANES = 16384
-"""Threads of a sum on a GPU."""
+"""Threads of the first stage of a sum on a GPU."""
 GROUPS = 128
-"""Threads that sum what these found."""
+"""Threads of the second stage."""
 PIECE = 4096
 """Elements that a thread of the CPU sums."""
 
 
 @wp.struct
 class Piece:
-    """Which elements a thread takes: `count` of them from `stride` * thread on, `step` apart."""
+    """Which of the elements a thread takes: it begins at `stride` * thread."""
 
     stride: int
-    step: int
-    size: int
-    count: int
+    step: int  # from an element of the thread to the next
+    size: int  # of the array
+    count: int  # largest number of elements of the thread if they are neighbours
 
 
 @wp.func
 def _end(piece: Piece, begin: int):
-    """Return the end of a thread's elements."""
+    """Return the end of the range of a thread's elements."""
     if piece.step > 1:
         return piece.size
     return wp.min(begin + piece.count, piece.size)
@@ -105,7 +106,7 @@ def _find_largest(
 def _add_up(
     # in
     sums: wp.array(dtype=wp.float64),
-    place: int,
+    place: int,  # of the total
     first: int,
     # out
     totals_out: wp.array(dtype=wp.float64),
