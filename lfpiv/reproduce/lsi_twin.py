@@ -18,8 +18,8 @@ from lfpiv.reproduce.planar_piv import SheetCamera, correlate_frames, sheet_imag
 from lfpiv.reproduce.rigs import VOXEL_MM, Rig, reconstruct_images, recorded_images, true_field, volume_grid
 from lfpiv.settings.processing import Correlation, Smart
 from lfpiv.simulation.flows import SwirlingJet
+from lfpiv.simulation.particles import LEAST_INTENSITY
 from lfpiv.simulation.scene import Noise
-from lfpiv.simulation.simulator import LEAST_INTENSITY
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 from lfpiv.velocity.cross_correlation import correlate
 from lfpiv.velocity.settings import cut_windows

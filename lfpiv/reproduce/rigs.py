@@ -30,9 +30,10 @@ from lfpiv.geometry.optics import random_on_pupil
 from lfpiv.progress import Progress
 from lfpiv.reconstruction.volume import reconstruct
 from lfpiv.settings.processing import Smart
+from lfpiv.simulation.camera_images import expose, render_camera
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
-from lfpiv.simulation.simulator import expose, render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv.weights.operator import Weights, build_weights
 from lfpiv_kernels import runtime
 from lfpiv_kernels.rendering import render

@@ -39,12 +39,12 @@ class Brightness(Table):
         """Draw diameters relative to the median, shape (count,)."""
         return np.exp(self.size_log_sd * rng.standard_normal(count))
 
-    def of_diameters(self, diameter: np.ndarray) -> np.ndarray:
+    def intensity_of(self, diameter: np.ndarray) -> np.ndarray:
         """Return the brightness of particles of given relative diameters, of mean 1 over the distribution."""
         spread = self.size_exponent * self.size_log_sd
         return diameter**self.size_exponent * np.exp(-(spread**2) / 2)
 
-    def of_cameras(self, cameras: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    def camera_factors(self, cameras: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the particles' brightness in each camera, of mean 1, shape (cameras, count)."""
         drawn = self.camera_log_sd * rng.standard_normal((cameras, count))
         return np.exp(drawn - self.camera_log_sd**2 / 2)

@@ -30,7 +30,7 @@ class PlacedParticles(NamedTuple):
     diameter: np.ndarray
     """Diameters relative to the median, shape (particle,)."""
     camera_factor: np.ndarray
-    """Further factors of the intensity in each camera, shape (camera, particle)."""
+    """Factor of the intensity in each camera, shape (camera, particle)."""
 
     def at_frame(self, frame: str) -> np.ndarray:
         """Return the positions in frame "a" or "b", shape (particle, 3) [mm]."""
@@ -43,7 +43,7 @@ class LitParticles(NamedTuple):
     placed: PlacedParticles
     """The particles."""
     power: np.ndarray
-    """Power of both pulses, shape (2,)."""
+    """Power of both pulses relative to the stated one, shape (2,)."""
     brightness: np.ndarray
     """Light of each particle in each camera and frame, relative to the mean, shape (camera, 2, particle)."""
 
@@ -60,6 +60,8 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     ------
     InputError
         If the scene has less than one particle, or its walls leave none.
+    ValueError
+        If the scene is a time series.
     """
     if scene.particles.instants is not None:
         raise ValueError("scene: expected a scene with pairs, got one with particles.instants. Call place_series.")
@@ -78,11 +80,11 @@ def place_particles(scene: Scene, pair: int) -> PlacedParticles:
     intensity = np.maximum(LEAST_INTENSITY, 1 + scene.particles.intensity_sd * rng.standard_normal(len(position)))
     scatter = scene.brightness or Brightness()
     diameter = scatter.diameters(len(position), np.random.default_rng([scene.seed, 21, pair]))
-    factor = scatter.of_cameras(len(scene.camera), len(position), np.random.default_rng([scene.seed, 22, pair]))
-    intensity = intensity * scatter.of_diameters(diameter)
+    factor = scatter.camera_factors(len(scene.camera), len(position), np.random.default_rng([scene.seed, 22, pair]))
+    intensity = intensity * scatter.intensity_of(diameter)
     if scene.wall is None:
         return PlacedParticles(position, displacement, intensity, diameter, factor)
-    # at no instant is a particle in a wall
+    # a particle must not be in a wall in either frame, nor midway
     fluid = ~np.any([scene.solid(position + part * displacement) for part in (-0.5, 0.0, 0.5)], axis=0)
     if not fluid.any():
         raise InputError(

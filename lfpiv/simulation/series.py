@@ -174,8 +174,8 @@ def _draw_traits(scene: Scene, count: int, instant: int) -> _Traits:
     intensity = np.maximum(LEAST_INTENSITY, 1 + scene.particles.intensity_sd * rngs[0].standard_normal(count))
     scatter = scene.brightness or Brightness()
     diameter = scatter.diameters(count, rngs[1])
-    factor = scatter.of_cameras(len(scene.camera), count, rngs[2])
-    return _Traits(intensity * scatter.of_diameters(diameter), diameter, factor)
+    factor = scatter.camera_factors(len(scene.camera), count, rngs[2])
+    return _Traits(intensity * scatter.intensity_of(diameter), diameter, factor)
 
 
 def _drawn(scene: Scene, count: int, instant: int) -> np.ndarray:

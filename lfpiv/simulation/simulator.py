@@ -20,45 +20,24 @@ from lfpiv.files import remove_leftovers, replacing_folder, require_empty
 from lfpiv.progress import Progress, ignore_progress
 from lfpiv.simulation import truth
 from lfpiv.simulation.camera_images import (
-    AREA_STEP_MM,
     FRAMES,
     StaticLight,
     board_truth,
     camera_images,
     expose,
-    image_area,
-    render_camera,
     series_images,
     static_light,
     white_image,
 )
 from lfpiv.simulation.image_files import ImageWriter
-from lfpiv.simulation.particles import (
-    LEAST_INTENSITY,
-    LitParticles,
-    PlacedParticles,
-    lit_particles,
-    place_particles,
-    seeded_size_mm,
-)
+from lfpiv.simulation.particles import LitParticles, lit_particles, place_particles, seeded_size_mm
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.scene_camera import SceneCamera, true_mapping
-from lfpiv.simulation.sensor import FULL_SCALE, SensorPattern, draw_pattern
+from lfpiv.simulation.sensor import SensorPattern, draw_pattern
 from lfpiv.simulation.series import SeriesInstant, place_series
 from lfpiv_kernels.rendering import real_optics
 
-__all__ = [
-    "AREA_STEP_MM",
-    "FRAMES",
-    "FULL_SCALE",
-    "LEAST_INTENSITY",
-    "PlacedParticles",
-    "expose",
-    "image_area",
-    "place_particles",
-    "render_camera",
-    "simulate",
-]
+__all__ = ["place_particles", "simulate"]
 
 log = logging.getLogger(__name__)
 
@@ -107,17 +86,20 @@ def simulate(scene: Scene | str | Path, out: str | Path, *, progress: Progress |
     return out / "experiment.toml"
 
 
-def _check_positions(scene: Scene, nominal: SceneCamera, particles: np.ndarray) -> None:
-    """Refuse dots and particles too near the lens, and log the share of them in the field of view."""
-    optics = nominal.optics
+def _check_positions(scene: Scene, at_board: SceneCamera, particles: np.ndarray) -> None:
+    """Refuse dots and particles too near the lens, and log the share of them in the field of view.
+
+    `at_board` is the camera where it stood before it moved, `particles` are positions, shape (n, 3) [mm].
+    """
+    optics = at_board.optics
     half = np.array(optics.sensor_shape[::-1]) * optics.pixel_mm / 2
     board = board_truth(scene)
     dots = np.concatenate(
         [scene.board.dots_mm(depth) for depth in scene.board.planes_mm] if board is None else board.dots_mm
     )
     seen = (
-        ("board.planes_mm", "the dots", dots, nominal),
-        ("volume.size_mm", "the particles", particles, nominal.at_particles),
+        ("board.planes_mm", "the dots", dots, at_board),
+        ("volume.size_mm", "the particles", particles, at_board.at_particles),
     )
     for key, label, points, camera in seen:
         _check_windows(camera, label, points)
@@ -134,7 +116,7 @@ def _check_positions(scene: Scene, nominal: SceneCamera, particles: np.ndarray) 
 
 
 def _check_windows(camera: SceneCamera, label: str, points: np.ndarray) -> None:
-    """Refuse windows that are not between the points and the lens, or that rays meet at grazing incidence."""
+    """Refuse windows that are not between points (n, 3) [mm] and the lens, or that rays meet at grazing incidence."""
     so, radius = camera.optics.object_distance_mm, camera.optics.pupil_radius_mm
     try:
         local = camera.local_mm(points)
@@ -220,9 +202,9 @@ def _camera_images(
     white: np.ndarray,
     static: StaticLight | None,
 ) -> Iterator[tuple[str, np.ndarray, list[int] | None]]:
-    """Yield path and noise-free image [count] of one camera, and the noise's seed; None: by the image's number.
+    """Yield path and noise-free image [count] of one camera, and the seed of its noise; None: by its number.
 
-    An instant of a series has a seed of its own, so it does not depend on the length of the series.
+    An instant of a series has a seed of its own, so its noise does not depend on the length of the series.
     """
     for path, image in camera_images(scene, number, pairs, white=white, static=static):
         yield path, image, None
@@ -231,13 +213,14 @@ def _camera_images(
 
 
 def _background_names(scene: Scene) -> list[str]:
-    """Return the paths of the images without particles: for pairs as many as frames, for a series a single path."""
+    """Return the paths of the images without particles: for pairs a path per frame, for a series a single path."""
     if scene.particles.instants is not None:
         return ["background/{camera}.tif"]
     return [f"background/{{camera}}_{frame}.tif" for frame in FRAMES]
 
 
 def _pattern(scene: Scene, number: int) -> SensorPattern | None:
+    """Draw the pixels' gains, offsets and faults of a camera; None without a table ``[sensor]``."""
     camera = scene.camera[number]
     if camera.sensor is None:
         return None
@@ -251,7 +234,8 @@ def _background_image(
 
     In a series the recordings are of both pulses in turn.
     """
-    camera, count = scene.camera[number], scene.background.averaged if scene.background else 1
+    assert scene.background is not None
+    camera, count = scene.camera[number], scene.background.averaged
     rng = np.random.default_rng([scene.seed, 28, number, frame])
     pulses = np.random.default_rng([scene.seed, 29, frame])  # equal for all cameras
     mean = np.zeros(camera.optics.sensor_shape)

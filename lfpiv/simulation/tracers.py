@@ -21,12 +21,16 @@ CHUNK = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class TracerScaling:
-    """Map from the unit of a tracer file to a box of the volume; fields as in `lfpiv.simulation.flows.Tracers`."""
+    """Map from the unit of a tracer file to a box of the volume."""
 
     size_mm: Point
+    """Edges of the box (x, y, z) [mm]."""
     centre_mm: Point
+    """Centre of the box (x, y, z) [mm]."""
     box: tuple[Point, Point] | None
+    """Opposite corners that are mapped to the box [unit of the file]; None: the extent of the tracers."""
     peak_mm: float | None
+    """Largest displacement [mm]; None: as scaled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +45,7 @@ class TracerSet:
     """Search tree of the positions."""
 
     def interpolate(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the displacement at points (n, 3), shape (n, 3) [mm]. Points outside the tracers move to their box."""
+        """Return the displacement at points (n, 3), shape (n, 3) [mm]. Points are clipped to the tracers' extent."""
         points = np.clip(points_mm, self.position_mm.min(0), self.position_mm.max(0))
         parts = [self._fit(points[first : first + CHUNK]) for first in range(0, len(points), CHUNK)]
         return np.concatenate([np.empty((0, 3)), *parts])
@@ -51,8 +55,8 @@ class TracerSet:
         distance, index = self.tree.query(points, k=NEIGHBOURS + 1)
         reach = np.maximum(distance[:, -1:], 1e-300)
         index, weight = index[:, :-1], (1 - (distance[:, :-1] / reach) ** 2) ** 2 + 1e-6
-        arm = (self.tree.data[index] - points[:, None]) / reach[..., None]
-        design = np.concatenate([np.ones((*index.shape, 1)), arm], axis=2)
+        offset = (self.tree.data[index] - points[:, None]) / reach[..., None]
+        design = np.concatenate([np.ones((*index.shape, 1)), offset], axis=2)
         weighted = (design * weight[..., None]).transpose(0, 2, 1)
         normal = weighted @ design
         normal += 1e-10 * normal[:, :1, :1] * np.eye(4)
@@ -127,7 +131,7 @@ def load_series(file: str, series: str, scaling: TracerScaling) -> np.ndarray:
 
 @functools.lru_cache(maxsize=2)
 def tracers_between(file: str, series: str, scaling: TracerScaling, start: int, end: int) -> TracerSet:
-    """Return the tracers of a series midway between two of its instants, and what they move from one to the other."""
+    """Return the tracers of a series midway between two of its instants, and their displacements between these."""
     positions = load_series(file, series, scaling)
     first, second = positions[start], positions[end]
     middle = (first + second) / 2
@@ -135,7 +139,7 @@ def tracers_between(file: str, series: str, scaling: TracerScaling, start: int, 
 
 
 def _box_map(file: str, points: np.ndarray, scaling: TracerScaling) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scale [mm] and the centre that map the unit of the file into the box."""
+    """Return the scale [mm per unit of the file] and the centre [unit] of the map into the box."""
     corners = scaling.box if scaling.box is not None else (points.min(0), points.max(0))
     low, high = (np.asarray(corner, float) for corner in corners)
     if not (high > low).all():
@@ -144,7 +148,7 @@ def _box_map(file: str, points: np.ndarray, scaling: TracerScaling) -> tuple[np.
 
 
 def _read(file: str, names: tuple[str, ...], key: str) -> list[np.ndarray]:
-    """Return arrays of a .npz file as float64. `key` is that of the scene which names them."""
+    """Return arrays of a .npz file as float64. `key` of the scene names them, for the message if they are missing."""
     try:
         with np.load(Path(file), allow_pickle=False) as data:
             missing = [name for name in names if name not in data]

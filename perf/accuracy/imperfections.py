@@ -26,8 +26,9 @@ from lfpiv.progress import Progress
 from lfpiv.reproduce import page, plots, rigs, store, study
 from lfpiv.runs import pipeline
 from lfpiv.simulation.flows import window_mean
+from lfpiv.simulation.particles import place_particles
 from lfpiv.simulation.scene import Scene
-from lfpiv.simulation.simulator import place_particles, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv.velocity.cross_correlation import correlate
 
 TITLE = "Imperfect experiments"

@@ -22,12 +22,11 @@ from lfpiv.geometry.grid import Grid
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.reproduce import store
 from lfpiv.reproduce.rigs import BLOB_VOXEL, OPTICS, VOXEL_MM
-from lfpiv.simulation.camera_images import render_camera
+from lfpiv.simulation.camera_images import expose, render_camera
 from lfpiv.simulation.flows import Ring, Shear, Swirl, Uniform, window_mean
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
 from lfpiv.simulation.scene_camera import SceneCamera
 from lfpiv.simulation.sensor import Noise
-from lfpiv.simulation.simulator import expose
 from lfpiv.simulation.turbulence import Turbulence, TurbulentFlow
 from lfpiv_kernels.rendering import collect, render
 
@@ -318,7 +317,7 @@ def _light(
 ) -> tuple[np.ndarray, ...]:
     """Return the light of each particle in each camera (camera, n), at each frame."""
     scatter, count = condition.brightness, len(positions[0])
-    equal = scatter.of_diameters(scatter.diameters(count, rng)) * scatter.of_cameras(cameras, count, rng)
+    equal = scatter.intensity_of(scatter.diameters(count, rng)) * scatter.camera_factors(cameras, count, rng)
     if condition.dark or condition.flicker:
         draw, frames = rng.random(count), []
         for frame in range(len(positions)):

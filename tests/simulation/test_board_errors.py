@@ -7,8 +7,9 @@ from scipy.ndimage import gaussian_filter
 from support.simulated_cameras import MONTE_CARLO, ROUNDING, small_scene
 
 from lfpiv.simulation.board_errors import BoardErrors, true_board
+from lfpiv.simulation.camera_images import image_area, render_camera
 from lfpiv.simulation.scene import true_mapping
-from lfpiv.simulation.simulator import image_area, render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv_kernels.rendering import render
 
 PLANES = np.linspace(-1, 1, 400)

@@ -9,9 +9,9 @@ from support.simulated_cameras import SMALL_SCENE, camera, points, relative_diff
 
 from lfpiv.errors import InputError
 from lfpiv.geometry.optics import random_on_pupil
+from lfpiv.simulation.camera_images import image_area, render_camera
 from lfpiv.simulation.lens import PRESCRIPTIONS
 from lfpiv.simulation.scene import open_scene, true_mapping
-from lfpiv.simulation.simulator import image_area, render_camera
 from lfpiv_kernels.rendering import collect, real_optics, render
 
 TRACED_MM = 1e-10  # a path of 400 mm in float64 through eleven surfaces

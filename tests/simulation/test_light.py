@@ -6,10 +6,10 @@ import tifffile
 from scipy.ndimage import gaussian_filter
 from support.simulated_cameras import MONTE_CARLO, ROUNDING, small_scene
 
-from lfpiv.simulation.camera_images import static_light, white_image
+from lfpiv.simulation.camera_images import expose, render_camera, static_light, white_image
 from lfpiv.simulation.light import Brightness, Sheet, StrayLight
 from lfpiv.simulation.particles import lit_particles, place_particles
-from lfpiv.simulation.simulator import expose, render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv_kernels.rendering import render
 
 MANY = 20_000
@@ -36,14 +36,14 @@ def test_brightness_is_log_normal_in_each_camera_and_of_mean_one():
 def test_brightness_follows_the_diameter():
     table = Brightness(size_log_sd=0.25, size_exponent=2.0)
     diameter = table.diameters(MANY, np.random.default_rng(0))
-    brightness = table.of_diameters(diameter)
+    brightness = table.intensity_of(diameter)
     assert np.log(diameter).std() == pytest.approx(0.25, abs=MONTE_CARLO * 0.25 / np.sqrt(2 * MANY))
     spread = np.sqrt(np.exp(0.5**2) - 1)  # relative standard deviation of a log-normal value
     assert brightness.mean() == pytest.approx(1, abs=MONTE_CARLO * spread / np.sqrt(MANY))
     ratio = brightness / diameter**2
     assert np.ptp(ratio) < ROUNDING * ratio.mean()
     plain, sized = place_particles(many(), 0), place_particles(many(brightness=table.model_dump()), 0)
-    assert np.allclose(sized.intensity, plain.intensity * table.of_diameters(sized.diameter), rtol=ROUNDING)
+    assert np.allclose(sized.intensity, plain.intensity * table.intensity_of(sized.diameter), rtol=ROUNDING)
 
 
 def test_sheet_has_its_thickness_position_and_direction():

@@ -12,8 +12,9 @@ from support.calibration_scene import CALIBRATION_SCENE, MAPPING_PITCH, mean_err
 from support.simulated_cameras import SMALL_SCENE, camera, points, refusal, relative_difference, snell
 
 import lfpiv
+from lfpiv.simulation.camera_images import image_area, render_camera
 from lfpiv.simulation.scene import SceneCamera, open_scene, true_mapping
-from lfpiv.simulation.simulator import image_area, render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv_kernels.rendering import collect, real_optics, render
 
 SNELL_MM = 1e-8  # two float64 solvers: fsolve to 1e-11 in the slope, times 200 mm to the lens

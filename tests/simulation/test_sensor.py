@@ -5,10 +5,10 @@ import pytest
 import tifffile
 from support.simulated_cameras import MONTE_CARLO, camera, small_scene
 
-from lfpiv.simulation.camera_images import white_image
+from lfpiv.simulation.camera_images import expose, white_image
 from lfpiv.simulation.scene import Noise
 from lfpiv.simulation.sensor import Sensor, draw_pattern
-from lfpiv.simulation.simulator import expose, simulate
+from lfpiv.simulation.simulator import simulate
 
 SHAPE = (400, 500)
 SILENT = Noise(background=40.0, read_noise=0.0, full_well_e=0.0)

@@ -13,9 +13,10 @@ from support.simulated_cameras import MONTE_CARLO, ROUNDING, SMALL_SCENE, small_
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment
+from lfpiv.simulation.particles import place_particles
 from lfpiv.simulation.scene import Scene, open_scene
 from lfpiv.simulation.series import place_series, runge_kutta
-from lfpiv.simulation.simulator import place_particles, simulate
+from lfpiv.simulation.simulator import simulate
 
 FLOWS = {
     "uniform": {"kind": "uniform", "displacement_mm": (0.06, -0.03, 0.02)},

@@ -11,8 +11,9 @@ from support.simulated_cameras import MONTE_CARLO, ROUNDING, SMALL_SCENE, refusa
 
 from lfpiv.errors import InputError
 from lfpiv.experiment.opening import open_experiment
+from lfpiv.simulation.camera_images import render_camera
 from lfpiv.simulation.scene import Scene, open_scene
-from lfpiv.simulation.simulator import render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv_kernels.rendering import render
 
 

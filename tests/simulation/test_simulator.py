@@ -15,8 +15,8 @@ from scipy.stats import qmc
 from support import ray_twins
 from support.simulated_cameras import MONTE_CARLO, RIGS, ROUNDING, camera, land, points, relative_difference
 
+from lfpiv.simulation.camera_images import expose, render_camera
 from lfpiv.simulation.scene import Noise, SceneCamera, true_mapping
-from lfpiv.simulation.simulator import expose, render_camera
 from lfpiv_kernels.rendering import collect, render
 
 MOVED_RAYS = (
@@ -119,7 +119,7 @@ def test_images_add_exactly_and_do_not_depend_on_threads(device, tmp_path):
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import numpy as np, hashlib\n"
         "from support import simulated_cameras\n"
-        "from lfpiv.simulation.simulator import render_camera\n"
+        "from lfpiv.simulation.camera_images import render_camera\n"
         "from lfpiv_kernels import runtime\n"
         "from lfpiv_kernels.rendering import render\n"
         "runtime.start(sys.argv[2], threads=1)\n"

@@ -6,9 +6,10 @@ from scipy.stats import qmc
 from support.ray_twins import open_rays, pixel_rays, plane_light
 from support.simulated_cameras import MONTE_CARLO, camera, lens_gain, small_scene
 
-from lfpiv.simulation.camera_images import static_light, white_image
+from lfpiv.simulation.camera_images import image_area, render_camera, static_light, white_image
+from lfpiv.simulation.particles import place_particles
 from lfpiv.simulation.scene import true_mapping
-from lfpiv.simulation.simulator import image_area, place_particles, render_camera, simulate
+from lfpiv.simulation.simulator import simulate
 from lfpiv.simulation.surfaces import Surface
 from lfpiv_kernels.rendering import collect, render, surfaces
 
