@@ -15,9 +15,7 @@ from scipy.special import ndtr
 
 from lfpiv.errors import InputError
 from lfpiv.simulation.scene import Noise
-
-FULL_SCALE = 4095
-"""Largest count of the camera's 12 bits."""
+from lfpiv.simulation.sensor import FULL_SCALE
 
 
 @dataclass(frozen=True, kw_only=True)

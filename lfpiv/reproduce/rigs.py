@@ -33,6 +33,7 @@ from lfpiv.settings.processing import Smart
 from lfpiv.simulation.camera_images import expose, render_camera
 from lfpiv.simulation.flows import Ring, window_mean
 from lfpiv.simulation.scene import Scene, true_mapping
+from lfpiv.simulation.sensor import FULL_SCALE
 from lfpiv.simulation.simulator import simulate
 from lfpiv.weights.operator import Weights, build_weights
 from lfpiv_kernels import runtime
@@ -71,8 +72,6 @@ TURNED_DEG = {"drt": ((0.0, 0.0), (0.0, 0.0))} | {
 """Errors (yaw, roll) of each camera by the name of the mapping [degree]."""
 BLOB_VOXEL = 0.7
 """Standard deviation of the particles, Gaussian blobs, in images and in the truth [voxel]."""
-FULL_SCALE = 4095
-"""Largest count of the cameras' 12 bits."""
 PARTICLE_COUNTS = 400.0
 """Level of a pixel lit by one particle in focus [count]: at 1 ppm the brightest pixels stay below full scale."""
 PARTICLE_RAYS = 32_768

@@ -220,7 +220,7 @@ def _background_names(scene: Scene) -> list[str]:
 
 
 def _pattern(scene: Scene, number: int) -> SensorPattern | None:
-    """Draw the pixels' gains, offsets and faults of a camera; None without a table ``[sensor]``."""
+    """Draw the fixed pattern of a camera's sensor; None without a table ``[sensor]``."""
     camera = scene.camera[number]
     if camera.sensor is None:
         return None
