@@ -21,6 +21,9 @@ settings.register_profile("suite", derandomize=True, database=None, deadline=Non
 settings.register_profile("search", database=None, deadline=None, max_examples=5000)
 settings.load_profile("suite")
 
+SHARED_RUNS = {"small_run", "coarse_run", "reported", "killed_run"}
+"""Fixtures that several files use; the first process that needs such a run makes it, and the others wait for it."""
+
 SAMPLE_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -60,12 +63,31 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Leave out slow tests, unless all are asked for, or some by `-m` or by their names."""
-    if config.getoption("--all") or config.option.markexpr or any("::" in name for name in config.args):
-        return
-    slow = [item for item in items if is_slow(item)]
-    config.hook.pytest_deselected(items=slow)
-    items[:] = [item for item in items if item not in slow]
+    """Leave out slow tests, unless all are asked for, or some by `-m` or by their names; put files in order."""
+    asked = config.getoption("--all") or config.option.markexpr or any("::" in name for name in config.args)
+    slow = {item for item in items if is_slow(item)}
+    if not asked:
+        config.hook.pytest_deselected(items=slow)
+    items[:] = in_order_of_files([item for item in items if asked or item not in slow], slow)
+
+
+def in_order_of_files(items, slow):
+    """Return the tests file by file such that two processes neither wait for each other nor end far apart.
+
+    A file for each run that processes share comes first, so that it is made while other processes have other work. Then
+    files with many slow tests come before others, and files that read a shared run come last.
+    """
+    files = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    reads = {
+        path: {run for run in SHARED_RUNS for item in tests if run in item.fixturenames}
+        for path, tests in files.items()
+    }
+    ordered = sorted(files, key=lambda path: (bool(reads[path]), -len(slow.intersection(files[path]))))
+    makers = {run: next((path for path in reversed(ordered) if run in reads[path]), None) for run in SHARED_RUNS}
+    ordered.sort(key=lambda path: path not in makers.values())
+    return [item for path in ordered for item in files[path]]
 
 
 def is_slow(item):

@@ -443,6 +443,7 @@ def test_named_source_files_exist():
         folders = folders[:3]
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_house_shows_every_package_below_those_that_import_it():
     house = extension("house")
     place = {

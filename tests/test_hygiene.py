@@ -2,9 +2,11 @@
 
 import ast
 
+import pytest
 import style
 
 
+@pytest.mark.slow
 def test_the_rules_are_kept():
     """As ``python tests/style.py`` shows it."""
     assert style.broken() == []

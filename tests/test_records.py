@@ -304,6 +304,7 @@ def test_attributes_of_vectors_in_any_form(tmp_path, name, value):
             assert path.name in str(error)
 
 
+@pytest.mark.slow
 @FEWER
 @given(
     name=st.sampled_from(

@@ -171,6 +171,7 @@ def test_a_truth_that_a_killed_command_left_does_not_stop_the_same_command(made,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_case_that_another_command_made_meanwhile_stays(made, tmp_path):
     def other(step, fraction):
         if not (tmp_path / "data").exists():

@@ -101,6 +101,7 @@ def left_mm(found, true, board=BOARD):
     return np.sqrt((rest.reshape(-1, 3) ** 2).mean(0))
 
 
+@pytest.mark.slow(but="one camera along z")
 @pytest.mark.parametrize("optics", OPTICS)
 @pytest.mark.parametrize("cameras", ANGLES)
 def test_a_perfect_board_is_not_corrected(cameras, optics):
@@ -110,6 +111,7 @@ def test_a_perfect_board_is_not_corrected(cameras, optics):
     assert (found.plane_std[:, 2] > 0).all()  # what the labels could have shown
 
 
+@pytest.mark.slow(but="0-one camera along z")
 @pytest.mark.parametrize("cameras", ANGLES)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_perfect_board_is_not_corrected_where_dots_are_seen_worse_along_rows(cameras, seed):

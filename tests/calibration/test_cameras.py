@@ -300,6 +300,7 @@ def test_a_copied_board_image_is_refused_and_a_wrong_place_of_a_plane_is_named(r
     assert camera.report.sigma_nor_stated > 10 * camera.report.sigma_nor_test  # the stage's part and the lens's
 
 
+@pytest.mark.slow
 def test_planes_whose_images_are_exchanged_are_named(rig, tmp_path):
     experiment, _, _ = rig
     one, other = (experiment.board_image("only", plane).astype(np.uint16) for plane in (1, 2))

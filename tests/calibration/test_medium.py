@@ -97,6 +97,7 @@ def surface_of(angle, window, depth=1.0):
     return liquid_surface(labels, lens, optics)
 
 
+@pytest.mark.slow(but="30.0-1.333-20.0")
 @pytest.mark.parametrize(
     ("angle", "index", "height_mm"),
     [(-40.0, 1.333, 20.0), (30.0, 1.333, 20.0), (45.0, 1.5, 20.0), (-40.0, 1.333, 60.0), (-45.0, 1.5, 60.0)],
@@ -107,6 +108,7 @@ def test_the_surface_of_a_liquid_that_a_camera_looks_through_obliquely_explains_
     assert surface.residual_pitch < 3 * LABEL_MM / OPTICS.microlens_pitch_mm
 
 
+@pytest.mark.slow(but="window1")
 @pytest.mark.parametrize(
     ("window", "depth"), [*(({}, depth) for depth in (1.0, 0.93, 0.5, 2.0, 10.0)), (tank(1.0), 1.0), (tank(1.333), 0.5)]
 )
@@ -114,6 +116,7 @@ def test_no_liquid_is_found_in_air_whatever_the_scale_of_the_stage(window, depth
     assert surface_of(-40.0, window, depth) is None
 
 
+@pytest.mark.slow(but="mistake0")
 @pytest.mark.parametrize("mistake", [Mistake(stretch=2.0), Mistake(left_right=True)])
 def test_the_mistake_with_which_a_liquid_explains_the_labels_is_found(mistake):
     """Stated are half of the true depths, or the angle of a mirror image."""

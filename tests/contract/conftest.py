@@ -52,7 +52,7 @@ def computed(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def run(once):
+def killed_run(once):
     """Run on image pairs with tracked particles. An invocation before is killed after its first pair."""
     return once("contract-pairs", killed_and_resumed)
 
@@ -71,14 +71,14 @@ def killed_and_resumed(folder):
 
 
 @pytest.fixture(scope="session")
-def series(tmp_path_factory, run):
-    """Run on a time series beside a wall, with tracks, calibrated as `run`."""
+def series(tmp_path_factory, killed_run):
+    """Run on a time series beside a wall, with tracks, calibrated as `killed_run`."""
     folder = tmp_path_factory.mktemp("series")
     experiment = scene.simulate(done, folder, scene.INSTANTS)
     edit(experiment, "[smart]", SOLID + "[smart]\nrefinement = 1.0")
     for part in ("white", "board"):  # the same pixels, and the times of the files that were calibrated
-        shutil.copytree(run.experiment.parent / part, experiment.parent / part, dirs_exist_ok=True)
+        shutil.copytree(killed_run.experiment.parent / part, experiment.parent / part, dirs_exist_ok=True)
     (folder / "out").mkdir()
-    shutil.copy2(run.out / "calibration.h5", folder / "out")
+    shutil.copy2(killed_run.out / "calibration.h5", folder / "out")
     done("run", experiment, "--out", folder / "out")
     return Run(experiment, folder / "out")

@@ -53,26 +53,27 @@ WRONG = {
 }
 
 
-def wrong(run, folder, name):
+def wrong(killed_run, folder, name):
     """Return a wrong experiment and the words that a message about it must hold."""
-    file = shutil.copytree(run.experiment.parent, folder / "data") / run.experiment.name
+    file = shutil.copytree(killed_run.experiment.parent, folder / "data") / killed_run.experiment.name
     spoil, words = WRONG[name]
     spoil(file)
     return file, words
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_experiment_is_named(run, tmp_path, name):
-    file, words = wrong(run, tmp_path, name)
+def test_wrong_experiment_is_named(killed_run, tmp_path, name):
+    file, words = wrong(killed_run, tmp_path, name)
     with pytest.raises(lfpiv.InputError) as refusal:
         lfpiv.run(file, tmp_path / "out")
     assert all(word in str(refusal.value) for word in words), refusal.value
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow(but="missing image")
 @pytest.mark.parametrize("name", ["misspelt key", "missing image"])
-def test_command_line_shows_one_message(run, tmp_path, name):
-    file, words = wrong(run, tmp_path, name)
+def test_command_line_shows_one_message(killed_run, tmp_path, name):
+    file, words = wrong(killed_run, tmp_path, name)
     found = finish(start("-m", "lfpiv", "run", file, "--out", tmp_path / "out"))
     assert found.status == USAGE, found.errors
     assert "Traceback" not in found.errors
@@ -80,7 +81,7 @@ def test_command_line_shows_one_message(run, tmp_path, name):
     assert found.errors.count("lfpiv: ") == 1, found.errors
 
 
-def test_wrong_folders_and_formats_are_named(run, tmp_path):
+def test_wrong_folders_and_formats_are_named(killed_run, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     for call in (lfpiv.open_results, lfpiv.open_tracks, lfpiv.open_particles):
@@ -91,11 +92,11 @@ def test_wrong_folders_and_formats_are_named(run, tmp_path):
     with pytest.raises(lfpiv.InputError, match="empty"):
         lfpiv.open_experiment(empty)
     with pytest.raises((lfpiv.InputError, ValueError), match="docx"):
-        lfpiv.export_results(run.out, "docx")
+        lfpiv.export_results(killed_run.out, "docx")
 
 
-def test_damaged_results_are_named(run, tmp_path):
-    out = shutil.copytree(run.out, tmp_path / "out")
+def test_damaged_results_are_named(killed_run, tmp_path):
+    out = shutil.copytree(killed_run.out, tmp_path / "out")
     path = out / "vectors" / "pair_0001.nc"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
@@ -106,9 +107,9 @@ def test_damaged_results_are_named(run, tmp_path):
     assert "Traceback" not in found.errors
 
 
-def test_interrupt_ends_a_run_at_once(run, tmp_path):
+def test_interrupt_ends_a_run_at_once(killed_run, tmp_path):
     default = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # jobs in the background ignore it
-    process = start("-m", "lfpiv", "run", run.experiment, "--out", tmp_path / "out", preexec_fn=default)
+    process = start("-m", "lfpiv", "run", killed_run.experiment, "--out", tmp_path / "out", preexec_fn=default)
     assert "kernels run on" in process.stderr.readline()
     process.send_signal(signal.SIGINT)
     found = finish(process)

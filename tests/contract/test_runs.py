@@ -29,36 +29,36 @@ def displacements(vectors):
     return np.stack([vectors[f"displacement_{axis}"].values[vectors.valid.values] for axis in "xyz"], axis=-1)
 
 
-def test_a_killed_run_goes_on_where_it_was(run):
-    assert run.killed == -signal.SIGKILL
-    assert (run.out / "vectors" / "pair_0000.nc").read_bytes() == run.early
+def test_a_killed_run_goes_on_where_it_was(killed_run):
+    assert killed_run.killed == -signal.SIGKILL
+    assert (killed_run.out / "vectors" / "pair_0000.nc").read_bytes() == killed_run.early
 
 
 @pytest.mark.slow
-def test_vectors_of_a_killed_run_are_those_of_one_process(run):
-    rig = library.prepare(run.experiment, library.load_calibration(run.out / "calibration.h5"))
-    results = open_results(run.out)
+def test_vectors_of_a_killed_run_are_those_of_one_process(killed_run):
+    rig = library.prepare(killed_run.experiment, library.load_calibration(killed_run.out / "calibration.h5"))
+    results = open_results(killed_run.out)
     for pair in (0, 1):
         vectors = library.measure_pair(rig, pair)
         for name, values in arrays(vectors).items():
             np.testing.assert_array_equal(results[name].sel(pair=pair), values, err_msg=name)
 
 
-def test_vectors_of_pairs(run, stored, loops):
-    results = open_results(run.out)
+def test_vectors_of_pairs(killed_run, stored, loops):
+    results = open_results(killed_run.out)
     assert results.pair.values.tolist() == [0, 1]
     found = displacements(results)
     assert len(found) >= 0.9 * results.valid.size
     np.testing.assert_allclose(found.mean(axis=0), DISPLACEMENT_VOXEL, atol=BIAS)
     np.testing.assert_allclose(results.u, results.displacement_x * VOXEL_MM / 1000 / DT_S, rtol=1e-5)
     stored.check("run: vectors", loops, arrays(results))
-    volumes = sorted((run.out / "volumes").iterdir())
+    volumes = sorted((killed_run.out / "volumes").iterdir())
     assert [path.name for path in volumes] == [f"pair_000{pair}_{frame}.nc" for pair in (0, 1) for frame in "ab"]
     stored.check("run: volumes", loops, {path.name: xr.load_dataarray(path).values for path in volumes})
 
 
-def test_particles_of_pairs(run, stored, loops):
-    particles = open_particles(run.out)
+def test_particles_of_pairs(killed_run, stored, loops):
+    particles = open_particles(killed_run.out)
     assert particles.valid.sum() > 60
     moved = np.stack([particles[f"displacement_{axis}"].values[particles.valid.values] for axis in "xyz"], axis=-1)
     assert np.sqrt(((moved - DISPLACEMENT_VOXEL) ** 2).mean()) < PARTICLE
@@ -66,17 +66,17 @@ def test_particles_of_pairs(run, stored, loops):
     stored.check("run: particles", loops, columns, listed=True)
 
 
-def test_summary_and_report(run):
-    summary = json.loads((run.out / "summary.json").read_text("utf-8"))
+def test_summary_and_report(killed_run):
+    summary = json.loads((killed_run.out / "summary.json").read_text("utf-8"))
     assert all(camera["sigma_nor_test"] < 0.02 for camera in summary["calibration"].values())
-    assert "<svg" in (run.out / "report.html").read_text("utf-8")
+    assert "<svg" in (killed_run.out / "report.html").read_text("utf-8")
 
 
 @pytest.mark.slow
-def test_a_finished_run_repeats_nothing(run, tmp_path):
-    out = shutil.copytree(run.out, tmp_path / "out")
+def test_a_finished_run_repeats_nothing(killed_run, tmp_path):
+    out = shutil.copytree(killed_run.out, tmp_path / "out")
     before = {path: path.stat().st_mtime_ns for path in sorted(out.rglob("*.nc"))}
-    done("run", run.experiment, "--out", out, "--keep-volumes")
+    done("run", killed_run.experiment, "--out", out, "--keep-volumes")
     assert {path: path.stat().st_mtime_ns for path in sorted(out.rglob("*.nc"))} == before
 
 

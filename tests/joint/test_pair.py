@@ -85,6 +85,7 @@ def test_both_frames_fitted_together_measure_better(pair, fitted):
     assert vectors.attrs["error_correlation_voxel"] == pytest.approx([math.sqrt(5.9**2 + 12**2 / 3)] * 3, abs=0.05)
 
 
+@pytest.mark.slow
 def test_vectors_of_particles_that_are_unlike_bright_in_the_cameras_are_less_certain(weights, pair, fitted):
     """Such errors are the same in both frames, so only the cameras tell."""
     other = lfpiv.reconstruct_pair(weights, recorded(weights, unlike=1.0)[1], estimate="joint", sieve_voxel=0.7)
@@ -112,6 +113,7 @@ def test_the_field_is_finer_than_its_vectors(pair, fitted):
     assert float(np.abs(field.divergence).mean()) < 0.5 * float(np.abs(field.vorticity_y).mean())
 
 
+@pytest.mark.slow
 def test_volumes_of_a_joint_fit_come_on_other_voxels_by_the_grid(weights, pair, fitted):
     """A displacement is no light: it is not resampled as such, and its unit is the edge of the new voxels."""
     larger = lfpiv.Grid.from_extent(centre_mm=(0.1, -0.1, 0.2), size_mm=(2.25, 2.0, 1.75), voxel_mm=0.125)

@@ -41,6 +41,7 @@ def matrix_of_set(cut, number):
     return found[: cut.microimages.size]
 
 
+@pytest.mark.slow(but=", 20, 5")
 def test_rows_of_a_set_have_the_weights_of_their_rays(rig):
     blocks, cut, set_of = rig
     matrix, rows = matrix_of(blocks), cut.rows
@@ -63,6 +64,7 @@ def test_rows_of_profiles_without_light_are_left_out(rig):
         assert len(lit) == int(blocks.height.sum())
 
 
+@pytest.mark.slow(but=", 20, 5")
 def test_rays_and_voxels_get_the_light_of_a_set(rig):
     blocks, cut, _ = rig
     rng, projector = np.random.default_rng(1), Projector(cut)

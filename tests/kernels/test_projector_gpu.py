@@ -34,6 +34,7 @@ def form(request):
     return request.param
 
 
+@pytest.mark.slow(but="usual")
 @pytest.mark.parametrize("edge", EDGES.values(), ids=EDGES)
 def test_rays_and_voxels_get_the_light_of_the_weights(form, edge):
     blocks, rng = random_blocks(form, edge), np.random.default_rng(1)

@@ -44,6 +44,7 @@ def structure_of(image, decoder):
     return seen_structure(image - np.float32(decoder.background(image)[0]), decoder)
 
 
+@pytest.mark.slow(but="square-20-0.05")
 @pytest.mark.parametrize(
     ("layout", "count", "sigma_mm", "brightness"),
     [

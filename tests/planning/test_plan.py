@@ -37,6 +37,7 @@ def planned(small_run):
     return lfpiv.plan(simulating, pairs=PAIRS, workers=WORKERS, out=small_run.out)
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_the_run(planned, small_run):
     summary, experiment = small_run.summary, read_experiment(small_run.experiment)
     file = small_run.out / "vectors" / "pair_0000.nc"

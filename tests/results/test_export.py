@@ -182,6 +182,7 @@ def test_bad_arguments_are_one_message_and_leave_nothing(run, tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.slow(but="netcdf")
 @pytest.mark.parametrize("to", ["vti", "netcdf", "csv", "tecplot", "pivpy"])
 def test_a_failure_leaves_earlier_files_whole(run, tmp_path, monkeypatch, to):
     folder, _ = run

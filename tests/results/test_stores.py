@@ -78,7 +78,7 @@ def form(request, monkeypatch):
     return request.param
 
 
-@pytest.mark.slow(but="zarr-dask")
+@pytest.mark.slow(but="pairs-zarr-dask")
 def test_a_store_is_the_folder(run, form, dask):
     (path,) = lfpiv.export_results(run, form)
     folder, store = lfpiv.open_results(run), lfpiv.open_results(path)
@@ -122,6 +122,7 @@ def test_results_of_other_settings_replace_the_store(pairs):
     assert json.loads(store.attrs["smart"]) == {"iterations": 5} and store.sizes["pair"] == 3
 
 
+@pytest.mark.slow(but="netcdf")
 def test_a_killed_export_leaves_nothing(pairs, form, monkeypatch):
     inner = stacked_files.StackedFiles.block
 
@@ -165,6 +166,7 @@ def test_older_packages_are_named(tmp_path, monkeypatch, package):
     assert not (tmp_path / "export").exists()
 
 
+@pytest.mark.slow(but="zarr")
 def test_a_damaged_chunk_is_not_read_in_silence(pairs, form, monkeypatch):
     (path,) = lfpiv.export_results(pairs, form)
     chunk = path if form == "netcdf" else max((path / "u" / "c").rglob("[0-9]*"))
@@ -320,6 +322,7 @@ def test_a_disk_that_fills_up_anywhere_leaves_no_store(pairs, form, monkeypatch)
     xr.testing.assert_equal(lfpiv.open_results(path).load(), lfpiv.open_results(pairs).load())
 
 
+@pytest.mark.slow(but="netcdf")
 def test_two_exports_at_once_leave_a_whole_store(tmp_path, form, monkeypatch):
     write_run(tmp_path, NUMBERS[:2])
     inner = stacked_files.StackedFiles.block
@@ -352,7 +355,8 @@ def test_files_beyond_those_that_are_compared_at_first_are_compared_when_read(tm
         results.u.isel(pair=5).load()
 
 
-@pytest.mark.parametrize("block", [pytest.param(1, marks=pytest.mark.slow), 20_000])
+@pytest.mark.slow
+@pytest.mark.parametrize("block", [1, 20_000])
 def test_statistics_in_parts_are_those_of_the_whole(run, block, monkeypatch):
     (path,) = lfpiv.export_results(run, "netcdf")
     hide_dask(monkeypatch)

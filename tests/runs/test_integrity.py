@@ -87,6 +87,7 @@ def test_volumes_of_other_pairs_and_frames_are_not_correlated(coarse_run, out, c
     assert rejected(caplog) == [f"pair_000{name}.nc" for name in ("0_a", "1_a", "2_b", "3_a")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["weights", "image pairs"])
 def test_a_folder_that_is_removed_during_the_run_ends_it(coarse_run, tmp_path, step):
     out = coarse_run.prepared(tmp_path / "out")

@@ -12,8 +12,8 @@ LENS_TOLERANCE = 0.25
 """Peaks of one part of a small volume are off by a tenth or two of a voxel, which is a tenth or two of a microlens."""
 
 
+@pytest.mark.slow
 @pytest.mark.whole_run
-@pytest.mark.slow(but="1-columns")
 @pytest.mark.parametrize(
     ("lenses", "axis", "every", "code", "names"),
     [

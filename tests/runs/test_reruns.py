@@ -285,6 +285,7 @@ def test_another_program_and_another_folder_of_the_same_name_have_everything_che
     assert repeated(experiment.name, out) is None
 
 
+@pytest.mark.slow
 def test_an_image_stored_again_with_another_pixel_is_named(finished, capfd):
     """Files and their hashes differ. The right camera's images stay as they are."""
     experiment, out = finished
@@ -298,6 +299,7 @@ def test_an_image_stored_again_with_another_pixel_is_named(finished, capfd):
     assert named.startswith("pair 3: an image has the same pixels, all or nearly all, as an image of pair 0")
 
 
+@pytest.mark.slow
 def test_a_second_frame_that_is_the_first_one_but_for_a_pixel_fails_its_pair(finished, capfd):
     experiment, out = finished
     first, second = (experiment.parent / "particles" / "left" / f"pair_0002_{frame}.tif" for frame in "ab")

@@ -234,6 +234,7 @@ def test_particles_that_were_exchanged_are_noticed_and_warned_of(reference):
     assert all(warning.figures["ratio"] > 0.9 for warning in missed)
 
 
+@pytest.mark.slow
 def test_an_image_out_of_order_in_one_camera_is_named_with_its_instant(made, small_run, tmp_path):
     """Instants 3 and 4 show the same particles, 5 and 6 others. With 3 in place of 6, 4 is more like 6 than 5."""
     file = write_series(small_run, tmp_path / "data")

@@ -138,7 +138,7 @@ def test_images_of_other_particles_do_not_fit(rig, shown):
     assert not judged(rig, foreign).fits
 
 
-@pytest.mark.slow(but="2")
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", range(4))
 def test_images_of_another_pair_do_not_fit_however_well_they_are_explained(rig, shown, pair):
     """Images of few particles leave little light: pair 2 beside pair 1 leaves less than others."""
@@ -175,7 +175,7 @@ def test_cameras_of_unlike_scales_are_told_with_the_ratio(rig, small_run, tmp_pa
     assert 0.75 < float(said.split(" have ")[1].split()[0]) / 2**bits < 1.25  # the cameras are not equally bright
 
 
-@pytest.mark.slow(but="16")
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [16, 1 / 16])
 def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tmp_path, ratio):
     """Images of other pairs, on the usual scale, are the measure of chance and of the light that stands still."""
@@ -188,6 +188,7 @@ def test_a_camera_on_another_scale_in_one_pair_is_not_refused(rig, small_run, tm
     assert belonging.check(experiment, weights, [0]).sentence == belonging.check(rig[0], weights, [0]).sentence
 
 
+@pytest.mark.slow(but="False")
 @pytest.mark.parametrize("foreign", [False, True])
 def test_a_pair_with_a_frame_that_is_half_dark_is_judged_by_the_other_frame(rig, small_run, tmp_path, foreign):
     file = small_run.images(tmp_path / "data")

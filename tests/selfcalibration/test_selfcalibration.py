@@ -296,7 +296,7 @@ def disparity_at(at, shift):
     return Disparity(cameras=("left", "right"), centre_mm=at, shift_mm=shift, sharpness=np.eye(3), peak=0.5, rival=0.1)
 
 
-@pytest.mark.slow(but="0.05")
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.01, 0.05])
 def test_errors_of_disparities_are_no_movement(noise):
     rng = np.random.default_rng(9)

@@ -101,6 +101,7 @@ def test_chosen_results_open_their_experiment_file_or_none_and_no_changes_are_lo
     assert session.experiment is None and session.state["results_name"] == "c/run"
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_results_without_an_experiment_file_open_none(tmp_path, browser):
     from support.report_run import field
@@ -210,6 +211,7 @@ def test_each_pair_has_a_bar_beside_its_stage(tmp_path):
     assert stage["pairs"][1]["left"] == "about 3 min left"
 
 
+@pytest.mark.slow
 def test_a_run_records_each_pair(small_run, tmp_path, monkeypatch):
     from lfpiv.studio import run_process
 

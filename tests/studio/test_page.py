@@ -201,6 +201,7 @@ def test_sliders_that_were_moved_alone_reach_the_form(page):
     until(lambda: not page.get("x_changed"))
 
 
+@pytest.mark.slow
 def test_the_cost_of_the_campaign_is_told(page):
     page.open("preview")
     page.click("t-plan")

@@ -57,6 +57,7 @@ def test_a_pair_that_a_run_does_not_have_is_told(results):
         layers.field_at(lfpiv.open_results(results), "7")
 
 
+@pytest.mark.slow
 def test_the_script_draws_what_is_seen(results, tmp_path):
     import cv2
 
@@ -127,6 +128,7 @@ def test_bad_files_have_cards_and_the_others_are_shown(damaged, browser):
         assert [text.partition(" ")[0] for text in cards] == ["pair_0000.nc", "pair_0002.nc", "pair_0004.nc"]
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_file_that_is_damaged_behind_its_head_is_left_out_of_the_mean(results, tmp_path, browser):
     folder = tmp_path / "run"

@@ -111,6 +111,7 @@ def test_films_show_every_moment_and_one_turn(page):
     assert page.execute_script("return trame.state.get('r_moment')") == moment
 
 
+@pytest.mark.slow
 def test_the_script_makes_the_picture_that_is_downloaded(page, tmp_path):
     state(page, r_particles=True, r_tracks=True, r_arrows=True)
     seen = picture(page)

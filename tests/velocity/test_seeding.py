@@ -64,6 +64,7 @@ def test_a_reflection_does_not_make_the_rest_empty():
     assert unseeded_voxels(pair) is None
 
 
+@pytest.mark.slow
 def test_an_empty_layer_of_a_large_volume_is_found():
     """Local maxima are sought in some planes of it, and means of the first volume over coarse cells come first."""
     shape, thickness = (64, 72, 72), 12
