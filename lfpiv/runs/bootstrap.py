@@ -49,7 +49,7 @@ def stored(experiment: Experiment, folder: Folder, stamp_of: StampOf) -> StoredD
     return known if stamp_of(known.pairs).fits(marks) else None
 
 
-def decide(
+def keep_or_measure(
     experiment: Experiment,
     folder: Folder,
     stamp_of: StampOf,

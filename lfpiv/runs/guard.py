@@ -1,8 +1,8 @@
 """Guard layers of a run: voxels beyond the volume's faces that are reconstructed and cut away.
 
 Light from beyond the volume reaches the same pixels as light from within. Without guard layers SMART puts it into the
-volume. `decide` measures once per output folder how far light reaches beyond each face, and stores the outcome. With
-``volume.guard_mm = "auto"`` the guard layers follow from it.
+volume. `keep_or_measure` measures once per output folder how far light reaches beyond each face, and stores the
+outcome. With ``volume.guard_mm = "auto"`` the guard layers follow from it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def with_guard(experiment: Experiment, guard: Layers) -> Experiment:
     return replace(experiment, grid=experiment.grid.padded(guard))
 
 
-def decide(
+def keep_or_measure(
     experiment: Experiment,
     folder: Folder,
     stamp_hash: str,

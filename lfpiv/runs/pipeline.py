@@ -293,9 +293,9 @@ def _after_all(current: Run, done: Invocation, lazy: _Lazily) -> Invocation:
         done = replace(done, settled=count)
     pairs = current.pairs_with_particles() if current.experiment.recording.is_series else []
     pairs = [pair for pair in pairs if not (figures := current.finished.get(pair)) or figures.verdict not in REFUSED]
-    tracks.decide(current.experiment, folder, current.tracks_stamp, pairs, lazy.work, current.step(TRACKS))
+    tracks.keep_or_make(current.experiment, folder, current.tracks_stamp, pairs, lazy.work, current.step(TRACKS))
     stamp, finished = current.damping_stamp, current.pairs_with_vectors
-    bootstrap.decide(current.experiment, folder, stamp, finished, lazy.work, current.step(SIMULATED))
+    bootstrap.keep_or_measure(current.experiment, folder, stamp, finished, lazy.work, current.step(SIMULATED))
     return done if lazy.built is None else replace(done, weights=lazy.built)
 
 

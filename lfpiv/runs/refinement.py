@@ -66,7 +66,7 @@ def read(folder: Folder) -> tuple[Refinement, Marks] | None:
 
 
 def factor(experiment: Experiment, found: Refinement | None) -> float:
-    """Return the refinement of an experiment: stated in its file, or measured; 1 before `decide`."""
+    """Return the refinement of an experiment: stated in its file, or measured; 1 before it is measured."""
     stated = experiment.smart.refinement
     if stated != "auto":
         return float(stated)
@@ -78,7 +78,7 @@ def refined(experiment: Experiment, factor: float) -> Experiment:
     return replace(experiment, grid=experiment.grid.refined(factor))
 
 
-def decide(
+def keep_or_measure(
     experiment: Experiment,
     folder: Folder,
     stamp_hash: str,

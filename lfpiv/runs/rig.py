@@ -185,8 +185,8 @@ def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
     calibration, self_calibration = self_calibrate(run, board)
     given = run.experiment, run.folder, run.calibration_stamp.hash, standing.content, calibration
     light = functools.cache(functools.partial(sampled_light, run.experiment, calibration.cameras))
-    run = replace(run, guard=guard.decide(*given, light))
-    run = replace(run, refinement=refinement.decide(*given, light, run.guard_layers))
+    run = replace(run, guard=guard.keep_or_measure(*given, light))
+    run = replace(run, refinement=refinement.keep_or_measure(*given, light, run.guard_layers))
     return run, Prepared(board=board, calibration=calibration, self_calibration=self_calibration)
 
 

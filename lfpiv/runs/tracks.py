@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SIZED = 50
-"""Largest number of pairs that tell the size of the particles."""
+MOST_SIZED = 50
+"""Largest number of pairs over which the median size of the particles is taken."""
 
 
-def decide(
+def keep_or_make(
     experiment: Experiment,
     folder: Folder,
     stamp_of: Callable[[Sequence[int]], Stamp],
@@ -46,10 +46,10 @@ def decide(
     make_work: Callable[[], PairWork],
     progress: StepProgress,
 ) -> None:
-    """Keep the stored tracks, or make and store them; without tracking or a series remove them.
+    """Keep the stored tracks, or make and store them; without tracking or without a series remove them.
 
-    `pairs` have linked particles in the folder. `make_work` returns the work on pairs with its weights; it is called
-    only if tracks must be made.
+    `pairs` have linked particles in the folder. `stamp_of` returns the stamp of the tracks of some pairs. `make_work`
+    returns the work on pairs with its weights; it is called only if tracks must be made.
     """
     wanted = experiment.tracking is not None and experiment.recording.is_series
     if not wanted or len(_instants(experiment, pairs)) < SHORTEST:
@@ -66,7 +66,7 @@ def decide(
         log.warning("tracks: not made, an image of the series is missing")
         return
     try:
-        table = make(make_work(), pairs, progress)
+        table = _make(make_work(), pairs, progress)
     except InputError as error:
         log.warning("tracks: not made: %s", error)
         return
@@ -82,7 +82,7 @@ def decide(
     )
 
 
-def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dataset:
+def _make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dataset:
     """Follow the particles of a series along its instants.
 
     Parameters
@@ -105,14 +105,14 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
         If an image cannot be used, or a table of particles is damaged.
     """
     experiment, recording = work.experiment, work.experiment.recording
-    search = replace(work.search, sigma_voxel=_size(work, pairs))
+    search = replace(work.search, sigma_voxel=_median_sigma_voxel(work, pairs))
     cameras = len(search.weights.cameras)
     instants = _instants(experiment, pairs)
 
     def look(instant: int, positions: np.ndarray, light: np.ndarray) -> FoundParticles:
         frame = work.light_again(recording.frame(instant))
-        every = np.repeat(light[:, None], cameras, axis=1)
-        cloud = Cloud(positions_mm=positions * experiment.grid.voxel_mm, light=every)
+        in_cameras = np.repeat(light[:, None], cameras, axis=1)
+        cloud = Cloud(positions_mm=positions * experiment.grid.voxel_mm, light=in_cameras)
         return search.look(frame.images, cloud, noise=frame.noise, clipped=frame.clipped or None)
 
     def candidates() -> Iterator[tuple[int, Candidates]]:
@@ -132,12 +132,12 @@ def make(work: PairWork, pairs: Sequence[int], progress: StepProgress) -> xr.Dat
 
 
 def _instants(experiment: Experiment, pairs: Sequence[int]) -> list[int]:
-    """Return the instants of pairs."""
+    """Return the instants of both frames of pairs, rising, each once."""
     return sorted({frame.number for pair in pairs for frame in experiment.pair_frames(pair)})
 
 
-def _size(work: PairWork, pairs: Sequence[int]) -> float:
-    """Return the median size of the particles [voxel] that an even choice of pairs showed."""
-    some = pairs[:: -(-len(pairs) // SIZED)]
+def _median_sigma_voxel(work: PairWork, pairs: Sequence[int]) -> float:
+    """Return the median size of the particles [voxel] in evenly chosen pairs."""
+    some = pairs[:: -(-len(pairs) // MOST_SIZED)]
     sizes = [read_particles(work.folder.particles(pair)).attrs["sigma_voxel"] for pair in some]
     return float(np.median(sizes))

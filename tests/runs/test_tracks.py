@@ -44,23 +44,23 @@ def folder(tmp_path, monkeypatch):
     return found
 
 
-def decide(folder, pairs=PAIRS, **changed):
+def kept(folder, pairs=PAIRS, **changed):
     images = changed.pop("images", "known")
-    tracks.decide(experiment(**changed), folder, stamp(images=images), pairs, unwanted, lambda fraction: None)
+    tracks.keep_or_make(experiment(**changed), folder, stamp(images=images), pairs, unwanted, lambda fraction: None)
     return folder.tracks.is_file()
 
 
 def test_tracks_that_fit_are_kept(folder):
-    assert decide(folder)
+    assert kept(folder)
 
 
 def test_tracks_that_nobody_asks_for_or_that_cannot_be_are_removed(folder):
-    assert not decide(folder, tracking=False)
+    assert not kept(folder, tracking=False)
     folder.tracks.write_bytes(b"stored")
-    assert not decide(folder, pairs=[3]), "two instants are no track"
+    assert not kept(folder, pairs=[3]), "two instants are no track"
 
 
 def test_other_pairs_need_new_tracks_and_missing_images_leave_them(folder, caplog):
     with pytest.raises(AssertionError, match="weights"):
-        decide(folder, pairs=[*PAIRS, 6])
-    assert decide(folder, pairs=[*PAIRS, 6], images=None) and "missing" in caplog.text
+        kept(folder, pairs=[*PAIRS, 6])
+    assert kept(folder, pairs=[*PAIRS, 6], images=None) and "missing" in caplog.text
