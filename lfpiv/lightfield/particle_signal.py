@@ -1,9 +1,9 @@
 """Measure whether an image shows particles or only noise.
 
 A particle lights many neighbouring pixels of a microimage. Read-out and photon noise is independent from pixel to
-pixel. So the correlation of near pixels under one microlens separates the two at any brightness. SMART and the
-correlation of volumes do not notice noise: they give a volume, and vectors that agree with their neighbours, from noise
-as well.
+pixel. So the correlation of near pixels under one microlens, the structure of the image, separates particles from noise
+at any brightness. SMART and the correlation of volumes do not notice noise: from noise, too, they give a volume, and
+vectors that agree with their neighbours.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ CLIP = 5.0
 _LEAST_GAIN = 0.2  # least gain of a pixel that counts
 _MEAN_REACH_PITCHES = 3.0  # half width of the local mean that is subtracted
 _LAG = 0.2  # distance of the two pixels [pitch]: beyond a sensor's blur, within the light of a particle
-_LEAST_DEVIATION = 0.3  # lower limit of the robust standard deviation [counts], the noise of rounding
+_LEAST_DEVIATION = 0.3  # lower limit of the robust standard deviation [counts]: noise of rounding
 _LEAST_PAIRS = 1000  # least number of pairs of pixels
 
 
-def structure(light: np.ndarray, decoder: LightFieldDecoder, *, clip: float = CLIP) -> float:
+def near_pixel_correlation(light: np.ndarray, decoder: LightFieldDecoder, *, clip: float = CLIP) -> float:
     """Return the correlation of near pixels under the same microlens, from -1 to 1. It is about 0 for noise.
 
     Parameters
@@ -44,8 +44,8 @@ def structure(light: np.ndarray, decoder: LightFieldDecoder, *, clip: float = CL
     Returns
     -------
     float
-        The lower one of the correlations along both diagonals, so that stripes along rows or columns do not count. 1
-        where too few pixels lie inside microimages.
+        Of the correlations along both diagonals the lower, so that stripes along rows or columns do not count. 1 if too
+        few pixels lie inside microimages.
     """
     core = (decoder.coverage > CORE_COVERAGE) & (decoder.gain > _LEAST_GAIN)
     if not core.any():
@@ -63,17 +63,17 @@ def structure(light: np.ndarray, decoder: LightFieldDecoder, *, clip: float = CL
     return min(_correlation(flat, inner, lens, lag, side) for side in (lag, -lag))
 
 
-def seen_structure(light: np.ndarray, decoder: LightFieldDecoder) -> float:
-    """Return the structure of an image with few bright or many dim particles; parameters as for `structure`.
+def measure_structure(light: np.ndarray, decoder: LightFieldDecoder) -> float:
+    """Return the structure of an image without its dark level (rows, columns) [counts], from -1 to 1.
 
     Clipping removes a few bright particles on a large sensor. So a low structure is measured again without clipping.
     """
-    found = structure(light, decoder)
-    return max(found, structure(light, decoder, clip=math.inf)) if found < NOISE else found
+    found = near_pixel_correlation(light, decoder)
+    return max(found, near_pixel_correlation(light, decoder, clip=math.inf)) if found < NOISE else found
 
 
 def _clipped(values: np.ndarray, core: np.ndarray, clip: float) -> np.ndarray:
-    """Clip values to `clip` robust standard deviations about the median. Hot pixels lose their weight."""
+    """Clip values to `clip` robust standard deviations about the median, which limits the weight of hot pixels."""
     median = float(np.median(values[core]))
     reach = clip * max(NORMAL_MAD * float(np.median(np.abs(values[core] - median))), _LEAST_DEVIATION)
     return np.clip(values, median - reach, median + reach)

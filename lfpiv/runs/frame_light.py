@@ -17,7 +17,7 @@ import numpy as np
 from lfpiv.errors import InputError
 from lfpiv.experiment.recording import Frame
 from lfpiv.lightfield import frame_comparison, image_checks
-from lfpiv.lightfield.particle_signal import NOISE, seen_structure
+from lfpiv.lightfield.particle_signal import NOISE, measure_structure
 from lfpiv.lightfield.saturation import saturated_pixels
 from lfpiv.lightfield.standing_light import remains_warnings
 from lfpiv.warn import Warning
@@ -83,7 +83,7 @@ def frame_light(
         images[name], noise[name] = without_background(camera, raw, darks[name], frame)
         light = images[name]
         clipped[name] = saturated_pixels(raw, top)
-        structure[name] = seen_structure(light, camera.decoder)
+        structure[name] = measure_structure(light, camera.decoder)
         fingerprints[name] = frame_comparison.fingerprint(raw)
         judged = raw if camera.standing is None else np.where(camera.standing.pixels, 0, raw)
         others = {other: one.decoder for other, one in cameras.items() if other != name}

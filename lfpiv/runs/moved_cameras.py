@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lfpiv.lightfield.particle_signal import NOISE, seen_structure
+from lfpiv.lightfield.particle_signal import NOISE, measure_structure
 from lfpiv.progress import StepProgress
 from lfpiv.records import validate
 from lfpiv.runs.frame_light import read_darks, without_background
@@ -299,7 +299,7 @@ class ShownParticles:
         for name, camera in self.cameras.items():
             raw = self.experiment.frame_image(name, frame)
             found[name], _ = without_background(camera, raw, self._darks[name], frame)
-            if frame not in self._levels and seen_structure(found[name], camera.decoder) < NOISE:
+            if frame not in self._levels and measure_structure(found[name], camera.decoder) < NOISE:
                 raise ValueError("expected particles, found only noise")
         self._levels[frame] = {name: float(np.mean(image, dtype=float)) for name, image in found.items()}
         kept = max(len(self.experiment.frames), KEPT_BYTES // sum(image.nbytes for image in found.values()))
@@ -312,7 +312,7 @@ class ShownParticles:
 def all_show_particles(frames: Sequence[Mapping[str, np.ndarray]], cameras: Mapping[str, CalibratedCamera]) -> bool:
     """Return whether images without still light show particles clearly, in every frame and camera."""
     return all(
-        seen_structure(images[name], camera.decoder) > CLEAR for images in frames for name, camera in cameras.items()
+        measure_structure(images[name], camera.decoder) > CLEAR for images in frames for name, camera in cameras.items()
     )
 
 

@@ -7,7 +7,7 @@ from support import scenes
 
 import lfpiv
 from lfpiv.lightfield.image_checks import signal_warnings
-from lfpiv.lightfield.particle_signal import EMPTY, NOISE, seen_structure, structure
+from lfpiv.lightfield.particle_signal import EMPTY, NOISE, measure_structure, near_pixel_correlation
 from lfpiv.simulation.simulator import simulate
 from lfpiv.warn import gather
 
@@ -41,7 +41,7 @@ def light_and_decoder(scene, folder):
 
 def structure_of(image, decoder):
     image = np.asarray(image, np.float32)
-    return seen_structure(image - np.float32(decoder.background(image)[0]), decoder)
+    return measure_structure(image - np.float32(decoder.background(image)[0]), decoder)
 
 
 @pytest.mark.slow(but="square-20-0.05")
@@ -73,8 +73,8 @@ def test_one_bright_particle_on_a_large_sensor_is_no_noise(tmp_path, device):
     near[max(row - 6, 0) : row + 6, max(column - 6, 0) : column + 6] = True
     noise = READ_NOISE * np.random.default_rng(2).standard_normal(image.shape).astype(np.float32)
     few = np.where(near, image, noise)
-    assert structure(few, decoder) < NOISE < PARTICLES < seen_structure(few, decoder)
-    assert seen_structure(noise, decoder) < EMPTY
+    assert near_pixel_correlation(few, decoder) < NOISE < PARTICLES < measure_structure(few, decoder)
+    assert measure_structure(noise, decoder) < EMPTY
 
 
 def test_noise_of_every_kind_is_noise(tmp_path, device):
