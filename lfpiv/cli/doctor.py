@@ -25,12 +25,12 @@ SHIFT_VOXEL = (0.7, -0.4, 1.3)
 
 
 class Finding(NamedTuple):
-    """Result of one examined item."""
+    """Result for an item: a package, a device or a self-test."""
 
     item: str
     finding: str
     good: bool
-    """False for a fault."""
+    """False if it is a fault."""
 
 
 def examine(device: str = "auto") -> Iterator[Finding]:
@@ -63,6 +63,7 @@ def examine(device: str = "auto") -> Iterator[Finding]:
 
 
 def _cuda() -> Iterator[Finding]:
+    """Yield the name and the memory of each visible GPU."""
     import warp as wp
 
     devices = wp.get_cuda_devices()
@@ -74,7 +75,7 @@ def _cuda() -> Iterator[Finding]:
 
 
 def _blobs(shape: tuple[int, int, int], centres: np.ndarray) -> np.ndarray:
-    """Return a volume of Gaussian particles with a standard deviation of 1 voxel."""
+    """Return a volume of Gaussian particles at `centres` (particle, 3) [voxel], standard deviation 1 voxel."""
     axes = np.ogrid[tuple(slice(n) for n in shape)]
     volume = np.zeros(shape, np.float32)
     for centre in centres:

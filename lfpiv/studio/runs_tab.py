@@ -17,7 +17,7 @@ from lfpiv.studio.session import Session
 SHOWN_LINES = 60
 """Lines of the log that are shown."""
 LOOK_EVERY_S = 0.5
-"""Time between two looks at a run [s]."""
+"""Interval at which the state of a run is read [s]."""
 
 
 class Runs:
@@ -42,22 +42,22 @@ class Runs:
         return self.session.places.within(str(self.state.p_out or "results"))
 
     def _changed(self, what: str) -> None:
-        """Offer the folder of the open results, or one beside the experiment file."""
+        """Offer the folder of the open results, or a new folder beside the experiment file."""
         results, experiment = self.session.results, self.session.experiment
         if what == "results" and results is not None and results.is_dir():
             self.state.p_out = self.session.places.name(results)
         elif what == "experiment" and results is None and experiment is not None:
             self.state.p_out = self.session.places.name(experiment.parent / "results")
 
-    def start(self, *asked: Any) -> None:
-        """Start a run with the folder and options that the page has; a finished part is not repeated."""
+    def start(self, out: str, pairs: str, workers: str, volumes: bool) -> None:
+        """Start a run with the folder and options of the page; finished parts are not repeated."""
         session, s = self.session, self.state
-        s.p_out, s.p_pairs, s.p_workers, s.p_volumes = asked  # which a busy browser sends later than the click
+        # a busy browser may set the state after the click
+        s.p_out, s.p_pairs, s.p_workers, s.p_volumes = out, pairs, workers, volumes
         if session.edited.changed:
             raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
-        given = {"--pairs": s.p_pairs, "--workers": s.p_workers}
-        options = [f"{name}={value}" for name, value in given.items() if value]
-        options += ["--keep-volumes"] if s.p_volumes else []
+        options = [f"{name}={value}" for name, value in {"--pairs": pairs, "--workers": workers}.items() if value]
+        options += ["--keep-volumes"] if volumes else []
         self.process = run_process.start(session.edited.path, self.out, options)
         s.p_end, s.p_warnings = "", []
         self._look()
@@ -70,14 +70,14 @@ class Runs:
         self._look()
 
     async def _watch(self) -> None:
-        """Look at the run of the folder again and again."""
+        """Show the state of the run again and again."""
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
             with self.state:
                 self.session.guarded(self._look)()
 
     def _look(self) -> None:
-        """Show what the run of the folder does, whoever started it."""
+        """Show the state of the run that writes the folder, whoever started it."""
         s = self.state
         try:
             out = self.out
@@ -109,6 +109,7 @@ class Runs:
             self.session.changed("results")
 
     def _cards(self, warnings: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return the texts, links and places that the page shows of warnings."""
         draft = self.session.draft
         cameras = [] if draft is None else [str(camera.get("name")) for camera in draft.get(("camera",)) or []]
         return [warning_cards.card(warning, cameras) for warning in warnings]
@@ -148,8 +149,8 @@ class Runs:
             )  # fmt: skip
             with html.Template(v_for="stage in p_stages", key="stage.name"):
                 self._bar("stage", "lf-stage")
-                with html.Template(v_for="one in stage.pairs", key="one.name"):
-                    self._bar("one", "lf-stage lf-one")
+                with html.Template(v_for="pair in stage.pairs", key="pair.name"):
+                    self._bar("pair", "lf-stage lf-one")
             with html.Div(v_for="(warning, number) in p_warnings", key="number", classes="lf-card", role="alert"):
                 html.B("{{ warning.what }}")
                 html.Div("{{ warning.remedy }}")

@@ -33,7 +33,7 @@ def require_extra() -> None:
 
 
 def quiet_closed_pages() -> None:
-    """Let neither the server of messages nor its loop log that a page was closed while something was sent to it."""
+    """Suppress log records of connections that a closed page ended while the server was sending to it."""
 
     def kept(record: logging.LogRecord) -> bool:
         _, error, _ = record.exc_info or sys.exc_info()
@@ -73,7 +73,7 @@ def serve(
     if not given.exists():
         raise InputError(f"{given}: expected an experiment file or the results of a run, found nothing there.")
     quiet_closed_pages()
-    arguments, sys.argv = sys.argv, sys.argv[:1]  # trame reads them
+    arguments, sys.argv = sys.argv, sys.argv[:1]  # trame would parse the options
     try:
         asyncio.run(_run(given.resolve(), port, browser, ready))
     finally:
@@ -81,8 +81,8 @@ def serve(
 
 
 async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], None] | None) -> None:
-    """Serve until a signal comes. Then runs are closed or left, and the process ends whatever its threads read."""
-    gc.disable()  # collections while modules are imported take a fifth of the start
+    """Serve until a signal comes. Then call the tabs' closers and end the process at once, threads included."""
+    gc.disable()  # garbage collection during imports takes a fifth of the start
     import pyvista
 
     from lfpiv.studio import access, page
