@@ -1,10 +1,10 @@
-"""Model of both frames: one volume midway in time, moved half way to each frame, and the light that it loses or gains.
+"""Model of both frames: a volume midway in time, displaced by half the displacement to each frame, with loss of light.
 
 With the light c of voxels midway in time, their displacement d and s = -1, +1 for the two frames, the volume of a frame
 is ``E_f = G' T(s d / 2) c exp(s rho) g_f``. T moves each voxel's light and spreads it as a cubic B-spline
-(`lfpiv_kernels.reconstruction.transport`). G' is the Gaussian that makes the sieve of that spread. g_f is the power of
-the frame's laser. rho is 0 unless particles are lost between the frames: half of the smooth logarithm of the second
-frame's brightness over the first frame's.
+(`lfpiv_kernels.reconstruction.transport`). G' is a Gaussian; together with this spread it is the sieve. g_f is the
+power of the frame's laser. rho is 0 unless particles are lost between the frames. Then it is half the logarithm of the
+second frame's brightness over the first frame's, smoothed.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from lfpiv_kernels.reconstruction.transport import SPREAD, Transport
 from lfpiv_kernels.transfer import to_device, to_host
 
 LEAST_BLUR_VOXEL = 0.2
-"""Standard deviation below which the rest of the sieve is left out: it hardly blurs [voxel]."""
+"""Standard deviation of G' below which it is left out, since it hardly blurs [voxel]."""
 SMOOTH_VOXEL = 2.0
-"""Standard deviation of the Gaussian in which brightness may differ between the frames [voxel]: wider than a particle,
-so that a change of brightness cannot stand for a displacement."""
+"""Standard deviation of the Gaussian that smooths rho [voxel]: wider than a particle, so that a change of brightness
+cannot imitate a displacement."""
 LEAST_LIGHT = 1e-3
-"""Least light of a voxel that is started from, as a share of the mean of the volume."""
+"""Least light of a voxel at the start of the fit, as a share of the mean of the volume."""
 DARK_SHARE = 0.1
-"""Light added to both volumes before their brightness is compared, as a share of the mean."""
+"""Light added to both volumes before the logarithm of their ratio, as a share of their mean."""
 LARGEST_LOSS = 3.0
 """Largest absolute rho."""
 SIGNS = (-1, 1)
-"""Direction in which the frames lie in time."""
+"""s: the first frame is before the middle in time, the second after it."""
 
 
 class JointModel:
@@ -44,6 +44,8 @@ class JointModel:
 
     Parameters
     ----------
+    weights : Weights
+        Weights of both frames.
     frames : sequence of two PreparedFrame
         Prepared images of both frames.
     """
@@ -53,10 +55,10 @@ class JointModel:
         self.field = SplineField(weights.grid, SPACING_VOXEL * weights.volume.voxel_mm / weights.grid.voxel_mm)
         self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel
         light = [
-            sum(float(one.image.sum(dtype=np.float64)) / one.camera_gain for one in frame.images.values())
+            sum(float(image.image.sum(dtype=np.float64)) / image.camera_gain for image in frame.images.values())
             for frame in frames
         ]
-        self.power = [np.float32(own / math.sqrt(light[0] * light[1])) for own in light]
+        self.power = [np.float32(of_frame / math.sqrt(light[0] * light[1])) for of_frame in light]
         """Power of each frame's laser, relative to the geometric mean of both."""
         self.rho: np.ndarray | None = None
         """Half the logarithm of the frames' brightness, shape (z, y, x), float32; None for equally bright frames."""
@@ -79,7 +81,7 @@ class JointModel:
         return GaussianBlur(SMOOTH_VOXEL, self.weights.grid.shape, truncate=TRUNCATE, border="nearest")
 
     def sieved(self, volume: np.ndarray) -> np.ndarray:
-        """Return G' of a volume (z, y, x): its own adjoint."""
+        """Return G' applied to a volume (z, y, x). G' is its own adjoint."""
         return _blurred(self._rest, volume)
 
     def smoothed(self, volume: np.ndarray) -> np.ndarray:
@@ -87,30 +89,30 @@ class JointModel:
         return _blurred(self._wide, volume)
 
     def transports(self, nodes: np.ndarray) -> tuple[Transport, Transport]:
-        """Return the transport to each frame."""
+        """Return the transport from midway in time to each frame, for the displacement at the nodes of `field`."""
         moved = self.field.values(nodes)
         first, second = (Transport(moved, sign / 2) for sign in SIGNS)
         return first, second
 
     def light_of(self, frame: int, light: np.ndarray) -> np.ndarray:
-        """Return the light midway in time as bright as it is in a frame, shape (z, y, x), float32."""
+        """Return the light midway in time with the brightness of a frame, 0 or 1, shape (z, y, x), float32."""
         bright: np.ndarray = light * self.power[frame]
         return bright if self.rho is None else bright * np.exp(SIGNS[frame] * self.rho)
 
     def volume(self, frame: int, light: np.ndarray, transport: Transport) -> np.ndarray:
-        """Return the volume of a frame, shape (z, y, x), float32."""
+        """Return the volume of a frame, 0 or 1, from the light midway in time, shape (z, y, x), float32."""
         return self.sieved(transport.push(self.light_of(frame, light)))
 
     def start(self, found: Sequence[Reconstruction], nodes: np.ndarray) -> np.ndarray:
-        """Return the light midway in time that the volumes of the frames by themselves share, shape (z, y, x), float32.
+        """Return the light midway in time from separate reconstructions of the frames, shape (z, y, x), float32.
 
-        It is the geometric mean of both, carried along the displacement. Where brightness may differ, rho is set.
+        It is the geometric mean of both volumes, moved midway. If rho is not None, it is set, too.
         """
-        own = [coefficients(one.volume, self.sieve_voxel) for one in found]
+        own = [coefficients(reconstruction.volume, self.sieve_voxel) for reconstruction in found]
         parts = [
             transport.pull(volume, self.lit) for transport, volume in zip(self.transports(nodes), own, strict=True)
         ]
-        least = LEAST_LIGHT * float(np.mean([one.mean(dtype=np.float64) for one in own]))
+        least = LEAST_LIGHT * float(np.mean([volume.mean(dtype=np.float64) for volume in own]))
         if self.rho is not None:
             smooth = [self.smoothed(part / power) for part, power in zip(parts, self.power, strict=True)]
             dark = np.float32(DARK_SHARE * (smooth[0].mean() + smooth[1].mean()))
@@ -121,5 +123,6 @@ class JointModel:
 
 
 def _blurred(blur: GaussianBlur | Sieve, volume: np.ndarray) -> np.ndarray:
+    """Return a blurred volume (z, y, x) on the host."""
     flat = to_device(np.ascontiguousarray(volume, np.float32).reshape(-1), float)
     return to_host(blur(flat)).reshape(volume.shape)
