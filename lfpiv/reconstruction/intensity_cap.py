@@ -1,12 +1,12 @@
-"""Intensity capping [1]_: particle images whose brightest pixels are limited, so that particles are more alike.
+"""Intensity capping [1]_: a limit of the brightest pixels makes bright particles more like the others.
 
 A particle's brightness differs between cameras, because they see light scattered at different angles, and between
-particles. A volume has one brightness per particle. What a camera shows beyond it becomes ghosts along its lines of
-sight, and the brightest particles make the most. The limit is a multiple of the typical peak, the median over the lit
-microimages of each one's brightest pixel. A few bright particles do not change it.
+particles. A volume has one brightness per particle. Additional light in a camera becomes ghosts along its lines of
+sight, most of it from the brightest particles. The limit is a multiple of the typical peak: the brightest pixel of each
+lit microimage, median over microimages. A few bright particles do not change it.
 
-Equally bright particles need no limit. It cuts the light of those that lie behind one another, and makes ghosts
-instead. So the images are asked first how unlike bright the particles are (`ParticleSizer.brightness_scatter`).
+Equally bright particles need no limit. It cuts the light of particles behind each other, and makes ghosts instead. So
+the scatter of the particles' brightness is measured first (`ParticleSizer.brightness_scatter`).
 
 .. [1] U. Shavit, R. J. Lowe, J. V. Steinbuck, "Intensity capping: a simple method to improve cross-correlation PIV
    results", Exp. Fluids 42 (2007) 225-240, doi:10.1007/s00348-006-0233-7.
@@ -19,15 +19,15 @@ import numpy as np
 POINT_CAP = 1.0
 """Limit for particles smaller than voxels, as a multiple of the typical peak. Their images have no shape to lose."""
 CAP = 2.0
-"""Limit for larger particles. It cuts a hundredth of the light of equally bright ones, and keeps their shape."""
+"""Limit for larger particles. It cuts 1 % of their light if they are equally bright, and keeps their shape."""
 PEAK_SIGMA = 5.0
-"""Least brightest pixel of a lit microimage [standard deviation of the noise]. The noise of its pixels stays below."""
+"""A microimage is lit if its brightest pixel exceeds this [standard deviation of the noise]."""
 
 
 def typical_peak(image: np.ndarray, microimage_px: float, noise: float) -> float:
-    """Return the median over lit microimages of their brightest pixel.
+    """Return the median over lit microimages of their brightest pixel [counts].
 
-    Squares as large as a microimage stand for the microimages.
+    The image is divided into squares as large as a microimage, whatever the places of the microimages.
 
     Parameters
     ----------

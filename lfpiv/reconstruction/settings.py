@@ -12,11 +12,11 @@ from lfpiv.settings.processing import Smart
 
 NORMALISATIONS = ("column", "paper")
 AUTO = "auto"
-"""Sieve and intensity cap that suit the size and the brightness of the particles."""
+"""Value of `sieve_voxel`, `intensity_cap` and `subsets` that is chosen for the images."""
 DEFAULTS = Smart()
 """Settings of SMART where none are stated."""
 PLAIN: dict[str, Any] = {"intensity_cap": 0.0, "sieve_voxel": 0.0, "subsets": 1, "tolerance": 0.0}
-"""Settings of SMART over all rays, without limit of the counts and sieve, in a given number of iterations."""
+"""Settings of SMART over all rays, without intensity cap and sieve, in a given number of iterations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +38,8 @@ class SmartSettings:
     voxel light fewer pixels than the voxel; the floor keeps the dark pixels beside them from counting against it. 0
     takes `floor` as it is."""
     intensity_cap: float | str = DEFAULTS.intensity_cap
-    """Upper limit of the counts as a multiple of the typical peak, the median over the lit microimages of each one's
-    brightest pixel; 0 for none. It makes particles of unlike brightness more alike between cameras and frames
+    """Upper limit of the counts as a multiple of the typical peak: the brightest pixel of each lit microimage, median
+    over microimages. 0 for none. It makes particles of unlike brightness more alike between cameras and frames
     (`lfpiv.reconstruction.intensity_cap`). "auto": none if the images show equally bright particles
     (`lfpiv.reconstruction.particle_size`); otherwise 1 for particles that ``sieve_voxel = "auto"`` finds smaller than
     voxels, and 2 for larger ones."""
