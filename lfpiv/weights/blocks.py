@@ -55,8 +55,11 @@ class PackedCamera:
     camera: Camera
     lattice: Lattice
     cell_mm: float
+    """Half extent of a lens's cell along s and t [mm]."""
     frame: np.ndarray
+    """From millimetres on the array to the frame of a lens's cell, see `lattice.cell_frame`, shape (2, 2)."""
     outline: np.ndarray
+    """Outline of the cell in this frame, see `lattice.cell_steps`, shape (step, 2) [pitch]."""
 
     @classmethod
     def from_camera(cls, camera: CalibratedCamera) -> PackedCamera:

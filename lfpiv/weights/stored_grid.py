@@ -37,14 +37,11 @@ class StoredGrid:
         The axis with the largest movement across the sensors' rows is the outermost one. Of the other two, the axis
         with the larger movement across the columns is the middle axis, or the innermost one for `columns_inmost`.
         """
-        centre = [
-            first + (n - 1) / 2 * grid.voxel_mm for first, n in zip(grid.first_centre_mm, grid.shape, strict=True)
-        ]
-        steps = np.concatenate([[centre[::-1]], centre[::-1] + np.eye(3)[::-1]])  # 1 mm along z, y, x
+        points = grid.centre_mm + np.concatenate([np.zeros((1, 3)), np.eye(3)[::-1]])  # the centre, 1 mm along z, y, x
         shift = np.zeros((3, 2))
         for camera in cameras:
-            st = camera.map(steps, np.zeros((4, 2)))
-            shift += np.abs(st[1:] - st[0])
+            image = camera.map(points, np.zeros((4, 2)))
+            shift += np.abs(image[1:] - image[0])
         outer = int(np.argmax(shift[:, 1]))
         far, near = sorted((axis for axis in range(3) if axis != outer), key=lambda axis: -float(shift[axis, 0]))
         return cls(grid, (outer, near, far) if columns_inmost else (outer, far, near))
@@ -62,7 +59,7 @@ class StoredGrid:
 
     @property
     def volume_shape(self) -> tuple[int, int, int]:
-        """Voxels of the grid (z, y, x)."""
+        """Voxel counts of the grid, order (z, y, x)."""
         return self.grid.shape
 
     @property
@@ -72,19 +69,19 @@ class StoredGrid:
 
     def models(self, camera: CalibratedCamera, form: str = "pixels") -> Iterator[np.ndarray]:
         """Yield the ray models of the voxels, plane by plane of the outermost axis, see `grid_models`."""
-        outer, middle, inner = (2 - axis for axis in self.order)
+        outer, middle, inner = (2 - axis for axis in self.order)  # 0: x, 1: y, 2: z
         return grid_models(camera, self.shape, self.positions_mm, (outer, middle, inner), form)
 
     def centres_mm(self, index: np.ndarray) -> np.ndarray:
-        """Return centres (x, y, z) [mm] of voxels by their stored index, shape (voxel, 3)."""
+        """Return the centres (x, y, z) of voxels by their stored index, shape (voxel, 3) [mm]."""
         return self.positions_mm(np.stack(np.unravel_index(index, self.shape), axis=1))
 
-    def positions_mm(self, steps: np.ndarray) -> np.ndarray:
-        """Return centres (x, y, z) [mm] of voxels by their indices along the stored axes, shape (voxel, 3)."""
-        centres = np.empty((len(steps), 3))
+    def positions_mm(self, indices: np.ndarray) -> np.ndarray:
+        """Return positions (x, y, z) [mm] by indices along the stored axes, perhaps fractional; shapes (point, 3)."""
+        positions = np.empty((len(indices), 3))
         for column, axis in enumerate(self.order):
-            centres[:, 2 - axis] = self.grid.first_centre_mm[axis] + steps[:, column] * self.grid.voxel_mm
-        return centres
+            positions[:, 2 - axis] = self.grid.first_centre_mm[axis] + indices[:, column] * self.grid.voxel_mm
+        return positions
 
     def index(self, voxel: tuple[int, int, int]) -> int:
         """Return the stored index of voxel (iz, iy, ix)."""
