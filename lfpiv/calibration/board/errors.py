@@ -22,9 +22,9 @@ KINDS = {
     "rotation": "turns of the planes about z",
     "dots": "places of the dots on the board",
 }
-"""What the kinds of errors are called."""
+"""Name of each kind of errors in messages."""
 COMPONENTS = {"depth": (2,), "shift": (0, 1), "tilt": (3, 4), "rotation": (5,)}
-"""Components of a plane's six errors of each kind."""
+"""Kind of errors -> its components among a plane's six errors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,15 +34,15 @@ class BoardErrors:
     planes_mm: np.ndarray
     """Stated depth of each plane [mm], shape (plane,)."""
     plane: np.ndarray
-    """Errors of each plane: shift [mm] and rotation [rad] along and about x, y, z, shape (plane, 6)."""
+    """Errors of each plane: shifts along x, y, z [mm], then rotations about x, y, z [rad], shape (plane, 6)."""
     plane_std: np.ndarray
-    """Standard errors of them, nan for planes without dots, shape (plane, 6)."""
+    """Standard errors of `plane` [mm, rad], nan for planes without dots, shape (plane, 6)."""
     dot_mm: np.ndarray
     """Errors of each dot along x and y [mm], shape (dot, 2)."""
     dot_std_mm: np.ndarray
-    """Standard errors of them, nan for dots that no camera sees, shape (dot, 2)."""
+    """Standard errors of `dot_mm` [mm], nan for dots that no camera sees, shape (dot, 2)."""
     corrected: tuple[str, ...] = ()
-    """Kinds of errors that the labels show, of `KINDS`. Errors of other kinds are 0."""
+    """Kinds of errors, keys of `KINDS`, that the labels show. Errors of other kinds are 0."""
     warnings: tuple[Warning, ...] = ()
     """Doubts about the board."""
 
@@ -52,7 +52,7 @@ class BoardErrors:
         return self.planes_mm + self.plane[:, 2]
 
     def points_mm(self, board: DotBoard, dot: np.ndarray) -> np.ndarray:
-        """Return the corrected world positions of dots given by number, shape (n, 3) [mm]."""
+        """Return the corrected world positions (x, y, z) of dots by their numbers, shape (n, 3) [mm]."""
         plane, site = np.divmod(dot, board.size)
         points = board.of_dots_mm(dot)
         middle = np.zeros((len(points), 3))

@@ -1,4 +1,4 @@
-"""Find the first dots of a board: its lattice in one plane, rectified with the nominal pose."""
+"""Find the lattice of a board's dots in a single plane, rectified with the nominal pose, to start the calibration."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ class FirstLattice:
     """The lattice that one plane shows when it is rectified with a pose."""
 
     points_mm: np.ndarray
-    """Points of the board at which the dots are stated, shape (d, 3) [mm]."""
+    """Stated positions (x, y, z) of the dots that were found, shape (dot, 3) [mm]."""
     chief_mm: np.ndarray
-    """Where the chief rays of the dots, as seen, meet the microlens array, shape (d, 2) [mm]."""
+    """Points of the microlens array where the chief rays of the dots' images meet it, shape (dot, 2) [mm]."""
     sign: int
     """+1 for bright dots, -1 for dark ones."""
     score: float
     """Sum of the dots' contrasts."""
     share: float
-    """Share of the strongest blobs, as many as the board has dots, on one lattice."""
+    """Share on one lattice of the strongest blobs, as many as the board has dots."""
 
     @property
     def regular(self) -> bool:
-        """Whether the blobs are a board, not chance."""
+        """Whether the blobs form a board's lattice, not one by chance."""
         return self.share >= _REGULAR
 
 
 def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: CameraPose) -> FirstLattice:
     """Find the lattice in one of the planes nearest to z = 0, rectified with the pose `plan`.
 
-    If no plane shows a regular lattice, the lattice returned is not `regular` either.
+    If no plane shows a regular lattice, the best irregular lattice is returned.
     """
     order = planes_from_middle(board)
     found: list[FirstLattice] = []
@@ -57,12 +57,12 @@ def first_lattice(signals: Signals, rectify: Rectifier, board: DotBoard, plan: C
 
 
 def planes_from_middle(board: DotBoard) -> np.ndarray:
-    """Return the numbers of the planes, the nearest to z = 0 first."""
+    """Return the numbers of the planes in the order of their distances from z = 0."""
     return np.argsort(np.abs(np.asarray(board.planes_mm)), kind="stable")
 
 
 def lattice_of_plane(rectified: Rectified, board: DotBoard, pose: CameraPose, plane: int) -> FirstLattice:
-    """Match the lattice to the blobs of a plane, either bright or dark; without a match it has no dots and score 0."""
+    """Match the lattice to the bright or the dark blobs of a plane; without a match it has no dots and score 0."""
     best = FirstLattice(np.empty((0, 3)), np.empty((0, 2)), 1, 0.0, 0.0)
     for sign in (1, -1):
         blobs = rectified.peaks(_PEAK_SPACINGS * board.spacing_mm, sign)
@@ -81,9 +81,9 @@ class _LatticeMatch:
     """Blobs on the lattice of a board."""
 
     index: np.ndarray
-    """Column and row of each blob that is a dot of the board, shape (n, 2)."""
+    """Column and row of each blob that is a dot of the board, shape (dot, 2)."""
     member: np.ndarray
-    """Numbers of these blobs, shape (n,)."""
+    """Numbers of these blobs, shape (dot,)."""
     regular: np.ndarray
     """Blobs on the lattice, on the board or beyond it, shape (blobs,), bool."""
 
@@ -126,9 +126,9 @@ def _lattice_waves(blobs: Blobs, board: DotBoard) -> tuple[np.ndarray, np.ndarra
     per spacing, and the nearest are preferred. A direction with a single dot takes the stated spacing.
     """
     weight = np.minimum(blobs.contrast, 3 * np.median(blobs.contrast))
-    size, turn = np.meshgrid(np.linspace(0.75, 1.35, 61), np.radians(np.linspace(-9, 9, 37)), indexing="ij")
-    prior = np.exp(-0.5 * (np.log(size) / 0.3) ** 2 - 0.5 * (turn / np.radians(9)) ** 2).ravel()
-    along = np.stack([size * np.cos(turn), size * np.sin(turn)], -1).reshape(-1, 2) / board.spacing_mm
+    scale, turn = np.meshgrid(np.linspace(0.75, 1.35, 61), np.radians(np.linspace(-9, 9, 37)), indexing="ij")
+    prior = np.exp(-0.5 * (np.log(scale) / 0.3) ** 2 - 0.5 * (turn / np.radians(9)) ** 2).ravel()
+    along = np.stack([scale * np.cos(turn), scale * np.sin(turn)], -1).reshape(-1, 2) / board.spacing_mm
     waves, phases = [], []
     for axis, count in enumerate(board.dots):
         wave = along if axis == 0 else along[:, ::-1] * (-1, 1)
