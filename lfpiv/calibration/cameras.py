@@ -75,7 +75,7 @@ def calibrate(experiment: Experiment | str | Path, progress: StepProgress | None
 
 
 def calibrate_or_continue(
-    experiment: Experiment, kept: KeptCameras | None, progress: StepProgress | None = None
+    experiment: Experiment, kept: KeptCameras | None, progress: StepProgress | None
 ) -> Calibration:
     """Calibrate every camera as `calibrate` does, without measuring again the dots of cameras in `kept`."""
     with threadpool_limits(1, "blas"):  # its sums depend on its number of threads

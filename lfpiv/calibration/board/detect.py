@@ -124,7 +124,7 @@ def rectifier(decoder: LightFieldDecoder, board: DotBoard, pose: CameraPose | No
     Behind a liquid dots are astigmatic, and sharp only through a part of the pupil.
     """
     half_x, half_y = ((n / 2 + MARGIN + 0.5) * board.spacing_mm for n in board.dots)
-    share = _PUPIL_PART if pose is not None and pose.is_behind_liquid else np.inf
+    share = _PUPIL_PART if pose is not None and pose.is_behind_liquid else 1.0
     return Rectifier(decoder, (half_x, half_y), board.diameter_mm, pupil_share=share)
 
 

@@ -186,10 +186,3 @@ class BoardDots(Labels):
     """Dots of each plane in the camera's field, shape (plane,)."""
     rejected: np.ndarray
     """Dots of each plane that were detected but not trusted, shape (plane,)."""
-
-    def outlines_px(self, optics: Optics, points: int = 48) -> np.ndarray:
-        """Return the outline of each measured dot's light on the sensor, (column, row) [pixel], (d, points, 2)."""
-        angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
-        rim = optics.pupil_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        on_array = self.chief_mm[:, None] + np.einsum("dab,pb->dpa", self.slope, rim)
-        return optics.sensor_px(on_array + (on_array - rim) * optics.sensor_per_pupil)

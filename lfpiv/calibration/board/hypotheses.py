@@ -118,7 +118,7 @@ def likely_mistake(
     board: DotBoard,
     orientation: Orientation,
     *,
-    stretches: Sequence[float] = (),
+    stretches: Sequence[float],
     in_liquid: Callable[[], Mistake | None],
 ) -> Mistake | None:
     """Return the mistake that clearly fits the dots best: `RIGHT` for the stated rig, None if none fits clearly.

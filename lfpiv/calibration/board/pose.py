@@ -215,7 +215,7 @@ class Rectified:
 
 
 class Rectifier:
-    """Carries the raw images of one camera to board planes, through the whole pupil or a share of its radius."""
+    """Carries the raw images of one camera to board planes, through a share of the pupil's radius; 1: all of it."""
 
     def __init__(
         self,
@@ -223,7 +223,7 @@ class Rectifier:
         half_width_mm: tuple[float, float],
         diameter_mm: float,
         *,
-        pupil_share: float = np.inf,
+        pupil_share: float,
     ):
         optics = decoder.optics
         self._half_width, self._diameter = half_width_mm, diameter_mm
