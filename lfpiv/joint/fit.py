@@ -85,7 +85,7 @@ def fit_pair(
     model: JointModel,
     found: Sequence[Reconstruction],
     nodes: np.ndarray,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None,
 ) -> JointFit:
     """Fit the light and the displacement of a pair.
 
