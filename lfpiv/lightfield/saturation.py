@@ -28,7 +28,7 @@ _BRIGHT_PERCENTILE = 99.9  # percentile above whose half pixels are bright
 _RANGES = {(1 << bits) - 1 << shift for bits in range(8, 17) for shift in (0, 16 - bits)}  # right- and left-justified
 
 
-def saturation_level(image: np.ndarray, white_level: float | None = None, *, piles: bool = True) -> float:
+def saturation_level(image: np.ndarray, white_level: float | None, *, piles: bool = True) -> float:
     """Return the value from which on pixels are saturated [counts]; infinite if none is.
 
     Parameters
