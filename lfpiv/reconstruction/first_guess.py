@@ -27,8 +27,8 @@ def multiplicative_guess(
     lit: DeviceArray,
     shown: Sequence[DeviceArray],
     *,
-    subset: Subset | None = None,
-    sums: DeviceArray | None = None,
+    subset: Subset | None,
+    sums: DeviceArray | None,
 ) -> DeviceArray:
     """Return exp(sum_i w log(1 + I / b) / sum_i w) - 1, scaled so that its projections have the images' light.
 
@@ -44,10 +44,10 @@ def multiplicative_guess(
         1 for voxels that some camera sees, on the device. The others are zero.
     shown : sequence of array, shape (lit pixel,), float32
         1 for pixels that such a voxel lights, else 0, of each image, on the device.
-    subset : Subset, optional
-        Rays of all cameras, over whose pixels i both sums of the quotient are taken. Default: all rays.
-    sums : array, shape (voxel,), float32, optional
-        sum_i w over the subset, above 0 where voxels are lit, on the device. Default: `column_sum`.
+    subset : Subset or None
+        Rays of all cameras, over whose pixels i both sums of the quotient are taken. None: all rays.
+    sums : array, shape (voxel,), float32, or None
+        sum_i w over the subset, above 0 where voxels are lit, on the device. None: `column_sum`.
 
     Returns
     -------

@@ -75,7 +75,7 @@ def prepare_images(
     *,
     floor: float | Mapping[str, float] | None,
     floor_share: float,
-    intensity_cap: float = 0.0,
+    intensity_cap: float,
 ) -> dict[str, PreparedImage]:
     """Prepare the images of all cameras, from `checked_images`; arguments as of `lfpiv.reconstruct`.
 
