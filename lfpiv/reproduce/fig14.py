@@ -218,7 +218,7 @@ class Judged:
     ppms: tuple[float, ...]
     """Seeding of the mappings."""
 
-    def pick(self, key: str, mapping: str, windows: str = "default") -> list[float]:
+    def pick(self, key: str, mapping: str, windows: str) -> list[float]:
         """Return a figure of one mapping and schedule for each seeding."""
         return [run[key] for run in self.runs if (run["mapping"], run["windows"]) == (mapping, windows)]
 
