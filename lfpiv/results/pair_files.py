@@ -177,7 +177,7 @@ class PairFiles:
         """Marks of the vectors, read once; None if they are missing or cannot be used."""
         return provenance.read_marks(self.vectors)
 
-    def _stamped(self, vectors: bool, volumes: bool, particles: bool = True) -> Iterator[tuple[Stamp, Marks | None]]:
+    def _stamped(self, vectors: bool, volumes: bool, particles: bool) -> Iterator[tuple[Stamp, Marks | None]]:
         """Yield the stamp of each file and the marks of the stored one; None if it is missing or cannot be used."""
         if vectors:
             yield self.stamp, self.vector_marks

@@ -120,7 +120,7 @@ def open_particles(folder: str | Path, *, pairs: tuple[int, int | None] | None =
     return result.assign_attrs({name: first[name] for name in shared if name in first})
 
 
-def particle_files(folder: Path, pairs: tuple[int, int | None] | None = None) -> dict[int, Path]:
+def particle_files(folder: Path, pairs: tuple[int, int | None] | None) -> dict[int, Path]:
     """Return the files of the linked particles by pair, in order; raise InputError if there are none."""
     first, last = pair_range(pairs)
     found = {}

@@ -116,7 +116,7 @@ def of_background(experiment: Experiment, calibration: str, pairs: Sequence[int]
     )
 
 
-def of_self_calibration(experiment: Experiment, calibration: str, background: str | None = None) -> Stamp | None:
+def of_self_calibration(experiment: Experiment, calibration: str, background: str | None) -> Stamp | None:
     """Return the stamp of the self-calibration; None if the experiment has none.
 
     `calibration` is a stamp's hash, `background` that of the subtracted light.

@@ -53,15 +53,15 @@ def is_store(path: Path) -> bool:
     return path.suffix == ".nc" and path.is_file()
 
 
-def open_store(path: Path, pairs: tuple[int, int | None] | None = None) -> xr.Dataset:
+def open_store(path: Path, pairs: tuple[int, int | None] | None) -> xr.Dataset:
     """Open a store lazily: dask arrays with the chunks of the store, or without dask arrays that are read when used.
 
     Parameters
     ----------
     path : Path
         NetCDF file of `write_netcdf`, or Zarr store of `write_zarr`.
-    pairs : tuple, optional
-        (A, B): only pairs A to B - 1; B may be None.
+    pairs : tuple or None
+        (A, B): only pairs A to B - 1; B may be None. None: all pairs.
 
     Raises
     ------
