@@ -89,7 +89,7 @@ def likely_mistakes(cameras: Sequence[str]) -> list[Mistake]:
     return found + [Mistake(Kind.HORIZONTAL, (name,)) for name in cameras]
 
 
-def other_mistakes(cameras: Sequence[str], shifts: Iterable[int], images: Iterable[int] = ()) -> list[Mistake]:
+def other_mistakes(cameras: Sequence[str], shifts: Iterable[int], images: Iterable[int]) -> list[Mistake]:
     """Return the mistakes that are tried where images do not fit clearly.
 
     Among them are shifts of a camera in time, by pairs or instants (`shifts`) and by single `images`.
