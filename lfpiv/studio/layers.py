@@ -125,7 +125,7 @@ def arrows(
     )
 
 
-def stream_lines(grid: pv.ImageData, seeds: int, colour: str, moving: bool = False) -> pv.PolyData:
+def stream_lines(grid: pv.ImageData, seeds: int, colour: str, moving: bool) -> pv.PolyData:
     """Return streamlines from a number of points in the volume; shorter ones while something moves."""
     filled = slim(grid, colour)
     filled["velocity"] = np.nan_to_num(grid["velocity"])
@@ -155,7 +155,7 @@ def points_of(table: xr.Dataset, good: np.ndarray | None = None) -> pv.PolyData:
     return cloud
 
 
-def track_lines(table: xr.Dataset, until: int | None = None) -> pv.PolyData:
+def track_lines(table: xr.Dataset, until: int | None) -> pv.PolyData:
     """Return the tracks of particles as lines, up to an instant if it is given."""
     good = table["valid"].values.astype(bool)
     if until is not None and "instant" in table:
