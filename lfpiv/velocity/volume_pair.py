@@ -58,7 +58,7 @@ def float_values(volume: xr.DataArray | np.ndarray, name: str) -> np.ndarray:
     return values
 
 
-def normalise(values: np.ndarray, name: str, solid: np.ndarray | None = None) -> np.ndarray:
+def normalise(values: np.ndarray, name: str, solid: np.ndarray | None) -> np.ndarray:
     """Return a copy of a volume (z, y, x) without background and scaled to a largest magnitude of 1.
 
     The background is the median of the voxels. Voxels flagged in `solid`, shape (z, y, x), may hold anything; the
