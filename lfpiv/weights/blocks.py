@@ -85,7 +85,7 @@ class PackedCamera:
             outline=cell_steps(lattice.layout),
         )
 
-    def footprints(self, form: str, cuts: Cuts = WHOLE) -> footprint.Footprints:
+    def footprints(self, form: str, cuts: Cuts) -> footprint.Footprints:
         """Return the kernel's launcher for this camera's blocks of a form."""
         return footprint.Footprints(
             self.camera,
@@ -125,7 +125,7 @@ def footprint_blocks(
     form: str,
     progress: StepProgress,
     allow: Callable[[int], None],
-    cuts: Cuts = WHOLE,
+    cuts: Cuts,
 ) -> Blocks:
     """Integrate the blocks of all voxels of a grid, or of nodes, for one camera.
 
@@ -163,7 +163,7 @@ def require_numbers(blocks: float, shape: tuple[int, ...]) -> None:
         )
 
 
-def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> tuple[float, float]:
+def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts) -> tuple[float, float]:
     """Return the mean number of blocks and of values per voxel in a sample of a grid's voxels, or of nodes."""
     model = _sampled_models(packed, places, form)
     blocks, values = (
@@ -172,7 +172,7 @@ def sample_blocks(packed: PackedCamera, places: Places, form: str, cuts: Cuts = 
     return float(blocks.mean()), float(values.mean())
 
 
-def sample_rows(packed: PackedCamera, places: Places, form: str, cuts: Cuts = WHOLE) -> float:
+def sample_rows(packed: PackedCamera, places: Places, form: str, cuts: Cuts) -> float:
     """Return the mean number of rows of rays per voxel in a sample of a grid's voxels, or of nodes."""
     blocks = blocks_of(packed, [_sampled_models(packed, places, form)], form, cuts=cuts)
     return float(blocks.height.sum(dtype=np.int64) / len(blocks.scale))

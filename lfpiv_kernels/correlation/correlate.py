@@ -99,7 +99,7 @@ def correlate_windows(
 
 
 def correlate_by_plan(
-    plan: Plan, first: Values, second: Values, *, symmetric: bool = False, reach: int = PEAK_REACH
+    plan: Plan, first: Values, second: Values, *, symmetric: bool, reach: int = PEAK_REACH
 ) -> WindowPeaks:
     """Do what `correlate_windows` does, by a given plan for the volumes' shape."""
     volumes = on_device(first), on_device(second)

@@ -128,7 +128,7 @@ class Footprints:
         If profiles are asked for a cell that is not a square, or for too many parts.
     """
 
-    def __init__(self, camera, lattice, cell_mm, microimages, *, frame, outline, form, cuts=(1, 1, 1)):
+    def __init__(self, camera, lattice, cell_mm, microimages, *, frame, outline, form, cuts):
         if form == "profiles" and len(outline) != 1:
             raise ValueError("form: profiles need a square microlens layout; use 'pixels' for a hexagonal one.")
         if not 1 <= math.prod(cuts) <= MOST_PARTS or (form == "profiles" and math.prod(cuts) > 1):
