@@ -180,7 +180,3 @@ class Recording:
     def by_frame(self, warning: Warning, frame: Frame) -> Warning:
         """Return a warning about a frame with its number, if it has no name within its pair."""
         return replace(warning, instants=(frame.number,)) if frame.name is None else warning
-
-
-PAIRS = Recording()
-"""An image pair, for what has to do with names only."""

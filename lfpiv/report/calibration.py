@@ -30,6 +30,8 @@ PHOTO_WIDTH = 640
 """Largest edge of a board image in the page [pixel], twice the width of a panel."""
 BINS = 50
 """Number of bins of a histogram of errors."""
+WORST_DOTS = 15
+"""Number of dots in the table of the largest errors."""
 
 _ROWS = (
     ("estimated error of the mapping, σ_nor [pitch]", "sigma_nor_test", 4),
@@ -203,9 +205,9 @@ def pupil_residual(displacement: np.ndarray) -> str:
     return to_svg(figure, f"Map over the pupil: {title}.")
 
 
-def _worst_dots(found: DotMap, most: int = 15) -> list[list[str]]:
-    """Return table rows of the dots with the largest error."""
-    worst = np.argsort(-found.error, kind="stable")[:most]
+def _worst_dots(found: DotMap) -> list[list[str]]:
+    """Return table rows of the `WORST_DOTS` dots with the largest errors."""
+    worst = np.argsort(-found.error, kind="stable")[:WORST_DOTS]
     return [
         [
             ", ".join(map(markup.general, found.position_mm[dot].round(6))),

@@ -23,7 +23,7 @@ import numpy as np
 import xarray as xr
 
 from lfpiv import hdf5
-from lfpiv.experiment.recording import PAIRS, Recording
+from lfpiv.experiment.recording import Recording
 from lfpiv.geometry.grid import AXES
 from lfpiv.report import flow
 from lfpiv.results import netcdf
@@ -62,7 +62,7 @@ class Survey:
     """Number of pairs in mean and fluctuation."""
 
 
-def survey(vectors: Mapping[int, Path], recording: Recording = PAIRS) -> Survey:
+def survey(vectors: Mapping[int, Path], recording: Recording) -> Survey:
     """Read an evenly spaced sample of the pairs; average one file after the other.
 
     Parameters
@@ -124,7 +124,7 @@ def _like(first: xr.Dataset, velocity: np.ndarray, valid: np.ndarray) -> xr.Data
     return xr.Dataset({**variables, "valid": (AXES, valid), **masked}, coordinates)
 
 
-def embed(found: Survey, view: flow.View, recording: Recording = PAIRS) -> tuple[str, int]:
+def embed(found: Survey, view: flow.View, recording: Recording) -> tuple[str, int]:
     """Encode the fields of a survey for the scripts.
 
     All fields share one block of little-endian 16-bit integers, which is gzipped and written in base64. A JSON text

@@ -59,8 +59,8 @@ def _list(texts: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{markup.escape(text)}</li>" for text in texts) + "</ul>"
 
 
-def contents(sections: Mapping[str, str], noun: str = "pair") -> str:
-    """Return links to the sections that are not empty."""
+def contents(sections: Mapping[str, str], noun: str) -> str:
+    """Return links to the sections that are not empty; `noun` is "pair" or "instant"."""
     names = {
         "truth": "Truth",
         "vectors": "Flow",

@@ -9,7 +9,7 @@ from typing import SupportsFloat
 
 import numpy as np
 
-from lfpiv.experiment.recording import PAIRS, Recording
+from lfpiv.experiment.recording import Recording
 from lfpiv.quantities import Scale, scale_of, significant
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
@@ -46,11 +46,11 @@ KEYS = ("valid", "uncertainty", "peak_ratio", "u", "v", "w", "sd_u", "sd_v", "sd
 mean and standard deviation of the velocity [m/s]."""
 
 
-def group(pairs: Sequence[PairFigures], most: int = MOST_ROWS) -> Groups:
-    """Merge pairs, sorted by number, into at most `most` groups of neighbours."""
+def group(pairs: Sequence[PairFigures]) -> Groups:
+    """Merge pairs, sorted by number, into at most `MOST_ROWS` groups of neighbours."""
     numbers = np.array([pair.number for pair in pairs])
     values = np.array([_values(pair) for pair in pairs], float)
-    edges = np.unique(np.linspace(0, len(pairs), min(most, len(pairs)) + 1).round().astype(int))
+    edges = np.unique(np.linspace(0, len(pairs), min(MOST_ROWS, len(pairs)) + 1).round().astype(int))
     parts = [slice(low, high) for low, high in itertools.pairwise(edges)]
     return Groups(
         first=np.array([numbers[part][0] for part in parts]),
@@ -79,8 +79,8 @@ def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) ->
 def section(
     pairs: Sequence[PairFigures],
     failures: Sequence[Failure],
-    finished: int | None = None,
-    recording: Recording = PAIRS,
+    finished: int | None,
+    recording: Recording,
 ) -> str:
     """Return the section on all pairs, as HTML.
 
@@ -90,8 +90,8 @@ def section(
         Finished pairs; at least one.
     failures : sequence of Failure
         Pairs without result, marked in the charts.
-    finished : int, optional
-        Number of all finished pairs, where `pairs` is an evenly chosen part of them. Default: all are given.
+    finished : int or None
+        Number of all finished pairs, where `pairs` is an evenly chosen part of them. None: all are given.
     recording : Recording
         What was recorded; it names results.
     """

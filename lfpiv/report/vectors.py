@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from lfpiv.experiment.recording import PAIRS, Recording
+from lfpiv.experiment.recording import Recording
 from lfpiv.geometry.names import COMPONENTS
 from lfpiv.quantities import Scale
 from lfpiv.report import flow, markup
@@ -29,9 +29,7 @@ from lfpiv.report.space_panel import in_space
 from lfpiv.report.summary import DampingFigures
 
 
-def section(
-    vectors: Mapping[int, pathlib.Path], recording: Recording = PAIRS, damping: DampingFigures | None = None
-) -> str:
+def section(vectors: Mapping[int, pathlib.Path], recording: Recording, damping: DampingFigures | None) -> str:
     """Return the section on the flow, as HTML, with the data of its views.
 
     Parameters
@@ -40,8 +38,8 @@ def section(
         Pair -> file of its vectors.
     recording : Recording
         What was recorded; it names results.
-    damping : DampingFigures, optional
-        Damping by ghosts, if it was measured.
+    damping : DampingFigures or None
+        Damping by ghosts; None if it was not measured.
     """
     if not vectors:
         return '<h2 id="vectors">Flow</h2>' + markup.paragraph(f"No {recording.noun} is finished yet.")

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import Normalize
 
-from lfpiv.experiment.recording import PAIRS, Recording
+from lfpiv.experiment.recording import Recording
 from lfpiv.report import markup
 from lfpiv.report.light_sheet import ENOUGH, LightSheet, find_sheet
 from lfpiv.report.markup import number, percent
@@ -29,7 +29,7 @@ BAND = (5, 95)
 """Percentiles that bound the range drawn over many volumes."""
 
 
-def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], recording: Recording = PAIRS) -> str:
+def section(pairs: Sequence[PairFigures], vectors: Mapping[int, Path], recording: Recording) -> str:
     """Return the section on the volumes, as HTML; empty where the first file holds nothing about its volumes.
 
     Parameters
@@ -104,7 +104,7 @@ def _projection(first: xr.Dataset, along: str, across: str, up: str, top: float)
 
 
 def quality_figure(
-    pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], recording: Recording = PAIRS, joint: bool = False
+    pair: int, first: xr.Dataset, histories: Mapping[str, np.ndarray], recording: Recording, joint: bool
 ) -> str:
     """Draw the residuals and the brightness over the depth.
 

@@ -193,7 +193,7 @@ def test_fields_are_stored_to_a_65000th_of_their_range(text):
 
 
 def test_mean_and_fluctuation_are_those_of_the_valid_vectors(reported):
-    found = survey(reported.vectors)
+    found = survey(reported.vectors, Recording())
     every = [report_run.field(pair) for pair in reported.vectors]
     masked = np.array([np.where(item["valid"], item["u"], np.nan) for item in every])[:2]  # the third has none
     with np.errstate(invalid="ignore"):
@@ -233,9 +233,9 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
                 overview.timings(summary),
                 overview.head(reported.experiment),
                 overview.verdict(reported.experiment, summary),
-                vectors.section(paths),
-                volumes.section(summary.pairs, paths),
-                pairs_section.section(summary.pairs, summary.failed),
+                vectors.section(paths, Recording(), None),
+                volumes.section(summary.pairs, paths, Recording()),
+                pairs_section.section(summary.pairs, summary.failed, None, Recording()),
             ]
         )
         assert (
@@ -250,7 +250,9 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
 
 def test_large_fields_are_thinned_out():
     large = report_run.field(0, (40, 120, 110))
-    html_text, step = embed(Survey(shown={0: large}, mean=None, fluctuation=None, read=1), flow.best_view(large))
+    html_text, step = embed(
+        Survey(shown={0: large}, mean=None, fluctuation=None, read=1), flow.best_view(large), Recording()
+    )
     (entry,) = json.loads(re.search(r'id="field-list">([^<]*)</script>', html_text)[1])["fields"]
     kept = len(entry["x"]) * len(entry["y"]) * len(entry["z"])
     assert len(entry["z"]) == 40 and step == math.ceil(math.sqrt(large["u"].size / MOST_IN_FIELD))
