@@ -67,8 +67,8 @@ def box_sum(volume: Values, window: Triple, keep: tuple[slice, ...] | None = Non
 
 def _layout(keep: tuple[slice, ...], shape: Triple) -> tuple[Triple, Triple, Triple]:
     """Return first place, distance and number of the places that slices keep."""
-    kept = [range(*of.indices(n)) for of, n in zip(keep, shape, strict=True)]
-    return tuple(of.start for of in kept), tuple(of.step for of in kept), tuple(map(len, kept))
+    kept = [range(*places.indices(n)) for places, n in zip(keep, shape, strict=True)]
+    return tuple(places.start for places in kept), tuple(places.step for places in kept), tuple(map(len, kept))
 
 
 def _sum_along(volume: np.ndarray, axis: int, width: int) -> np.ndarray:

@@ -127,7 +127,7 @@ def deform_pair(first: Given, second: Given, field: Values, spacing: tuple[float
     size, control = wp.vec3i(*first.shape), (field, wp.vec3(*spacing))
     if runtime.device().form == "gpu":
         pairs = zip(flat, (-0.5, 0.5), outputs, strict=True)
-        launch(*(deform_gpu.deform_call(c, size, *control, share, OFFSET, MARGIN, to) for c, share, to in pairs))
+        launch(*(deform_gpu.deform_call(c, size, *control, share, OFFSET, MARGIN, out) for c, share, out in pairs))
     else:
         inputs = [*flat, size, *control, OFFSET, MARGIN]
         launch(Call(_deform_pair, shape[0], inputs, outputs, inner=(shape[1],)))

@@ -147,7 +147,6 @@ def window_sums(
 ) -> wp.array:
     """Return the sums of voxels times taps over windows, shape `count`; along x first, which leaves least to do."""
     for axis in (2, 1, 0):
-        to = out if axis == 0 else None
         layout = {"step": step[axis], "count": count[axis], "border": WHOLE}
-        volume = filter_along(volume, axis, taps[axis], origin[axis], **layout, out=to)
+        volume = filter_along(volume, axis, taps[axis], origin[axis], **layout, out=out if axis == 0 else None)
     return volume

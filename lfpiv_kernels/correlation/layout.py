@@ -140,7 +140,8 @@ class Storage:
     def lattice(self, plan: Plan, corner: Triple) -> Lattice:
         """Return the lattice whose first window or block lies at `corner`."""
         lattice = Lattice()
-        lattice.corner, lattice.stride, lattice.phases = (wp.vec3i(*of) for of in (corner, plan.stride, self.phases))
+        lattice.corner, lattice.stride = wp.vec3i(*corner), wp.vec3i(*plan.stride)
+        lattice.phases = wp.vec3i(*self.phases)
         lattice.planes, lattice.pitch, lattice.lanes = self.shape[0], plan.pitch, self.shape[3]
         return lattice
 
@@ -155,7 +156,7 @@ def _distances(reach: int, stride: int, phase_pitch: int, lane_pitch: int) -> wp
 def make_layers(plan: Plan, layers: range, ring: int, group: int) -> Layers:
     """Return the structure of some layers of blocks, with lanes in groups of `group`."""
     blocks = Layers()
-    blocks.block, blocks.stride, blocks.lags = (wp.vec3i(*of) for of in (plan.block, plan.stride, plan.lags))
+    blocks.block, blocks.stride, blocks.lags = (wp.vec3i(*triple) for triple in (plan.block, plan.stride, plan.lags))
     blocks.begin, blocks.ring = layers.start, ring
     blocks.groups, blocks.group, blocks.lanes = -(-plan.lanes // group), group, plan.lanes
     return blocks

@@ -72,10 +72,12 @@ class SpectralProducts:
         plan, scratch = self.plan, (self.scratch, self.scratch_pitch)
         spectrum = Spectrum.for_block(plan.block, plan.search)
         transforms = zip((first, second), spectrum.planes, self.spectra, strict=True)
-        calls = [
-            transform_call(of, planes.transform, layers, plan.stride[0], *scratch, to) for of, planes, to in transforms
-        ]
-        launch(*calls)
+        launch(
+            *(
+                transform_call(volume, planes.transform, layers, plan.stride[0], *scratch, out)
+                for volume, planes, out in transforms
+            )
+        )
         tasks = make_layers(plan, layers, self.ring, GROUP)
         transformed = [_with_values(*pair) for pair in zip((first, second), self.spectra, strict=True)]
         inputs = [*transformed, spectrum.transform, tasks, _lanes_past(plan), self.scratch_pitch]

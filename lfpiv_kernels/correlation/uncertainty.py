@@ -111,10 +111,10 @@ def _window_sums(
         plus, minus = first * ahead[1], ahead[0] * second
         difference = plus - minus
         own = first * ahead[0] + second * ahead[1]
-        return [window_sum(of) for of in (plus, minus, difference, _squared_cubes(difference), own)]
+        return [window_sum(term) for term in (plus, minus, difference, _squared_cubes(difference), own)]
 
     squares = first * first + second * second
-    return [window_sum(of) for of in (first, second, first * second, squares)], map(terms, range(3))
+    return [window_sum(volume) for volume in (first, second, first * second, squares)], map(terms, range(3))
 
 
 def _squared_cubes(terms: np.ndarray) -> np.ndarray:

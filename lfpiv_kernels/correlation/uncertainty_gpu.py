@@ -51,8 +51,8 @@ def _sum_differences(
     # in
     one: wp.array3d(dtype=float),
     other: wp.array3d(dtype=float),
-    lag: wp.vec3i,
-    window: int,
+    lag: wp.vec3i,  # >= 0 [voxel]
+    window: int,  # voxels along x per sum
     before: int,  # voxels of a sum before the one that it belongs to
     begin: int,
     # out
@@ -92,9 +92,9 @@ def window_sums(
         volume = empty_volume((count[0], *one.shape[1:]))
         inputs = [one, other, lag, window[0], origin[0], step[0]]
         launch(Call(_sum_products, count[0], inputs, [volume], inner=tuple(one.shape[1:])))
-        for axis, to in ((1, None), (2, out)):
+        for axis, filtered in ((1, None), (2, out)):
             layout = {"step": step[axis], "count": count[axis], "border": filters_gpu.WHOLE}
-            volume = filters_gpu.filter_along(volume, axis, taps[axis], origin[axis], **layout, out=to)
+            volume = filters_gpu.filter_along(volume, axis, taps[axis], origin[axis], **layout, out=filtered)
 
     for k, volume in enumerate((first, second)):
         filters_gpu.window_sums(volume, origin, step, count, taps, sums[k])
@@ -102,11 +102,11 @@ def window_sums(
         product_sums(one, other, wp.vec3i(0, 0, 0), sums[2 + k])
     for axis in range(3):
         lag = wp.vec3i(*(int(k == axis) for k in range(3)))
-        to = 5 + 5 * axis
+        place = 5 + 5 * axis
         for k, (one, other) in enumerate(((first, second), (second, first), (first, first), (second, second))):
-            product_sums(one, other, lag, sums[to + k])
+            product_sums(one, other, lag, sums[place + k])
         squares = _squared_cubes(first, second, lag, reach)
-        filters_gpu.window_sums(squares, origin, step, count, taps, sums[to + 4])
+        filters_gpu.window_sums(squares, origin, step, count, taps, sums[place + 4])
     found = to_host(sums).astype(float)
     terms = [
         [plus, minus, plus - minus, squares, own_first + own_second]

@@ -64,7 +64,7 @@ def _window_statistics(
 def _extent(plan: Plan, search: Triple) -> Extent:
     """Describe a plan's volume for windows that move by up to `search`."""
     extent = Extent()
-    extent.shape, extent.margin, extent.window = (wp.vec3i(*of) for of in (plan.shape, search, plan.window))
+    extent.shape, extent.margin, extent.window = (wp.vec3i(*triple) for triple in (plan.shape, search, plan.window))
     extent.factors = wp.vec2i(*map(largest_factor, plan.window[1:]))
     return extent
 

@@ -100,5 +100,5 @@ def statistics_calls(
     pairs = zip(at_rows, statistics, strict=True)
     return [
         Call(_window_statistics, rows, inputs, at_rows, inner=(columns,)),
-        *(split_gpu.split_call([one, shape, measured], measured, to) for one, to in pairs),
+        *(split_gpu.split_call([rows_sum, shape, measured], measured, out) for rows_sum, out in pairs),
     ]

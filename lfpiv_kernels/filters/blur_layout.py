@@ -7,8 +7,8 @@ import warp as wp
 class Axis:
     """The weights along one axis, see ``AxisBlur`` in ``blur.h``."""
 
-    first: wp.array(dtype=int)
-    weight: wp.array(dtype=float)
-    taps: int
-    begin: int
-    end: int
+    first: wp.array(dtype=int)  # first input of each output, (output,)
+    weight: wp.array(dtype=float)  # flat (output, tap)
+    taps: int  # inputs of an output
+    begin: int  # outputs from here
+    end: int  # to here have the same weights

@@ -60,7 +60,7 @@ class PlaneShares:
         """Return the nodes of a voxel and its shares, shapes (node,); shares of zero are left out."""
         place = np.unravel_index(voxel, self.voxels)
         row, layer, column = (int(place[axis]) for axis in self.axes)
-        of_row, of_column = (of[layer].astype(np.float64) for of in (self.row_share, self.column_share))
+        of_row, of_column = (share[layer].astype(np.float64) for share in (self.row_share, self.column_share))
         share = np.einsum("j,k,n->jkn", of_row, of_column, self.share[layer].astype(np.float64))
         j, k, n = np.indices(share.shape)
         rows, columns = row + j + self.shift[layer, n, 0], column + k + self.shift[layer, n, 1]

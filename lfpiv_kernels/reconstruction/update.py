@@ -196,9 +196,9 @@ def update(
     stepped : array
         Where to write. It may be any of the other arrays.
     """
-    to = extrapolation or NO_EXTRAPOLATION
-    last, momentum, ahead = to.last, to.exponent, to.ahead
-    sweep_runs(_update, [volume, exponent, step, float(length), last, float(momentum)], [stepped, ahead])
+    momentum = extrapolation or NO_EXTRAPOLATION
+    inputs = [volume, exponent, step, float(length), momentum.last, float(momentum.exponent)]
+    sweep_runs(_update, inputs, [stepped, momentum.ahead])
 
 
 def sharpen(
@@ -215,7 +215,6 @@ def sharpen(
 
     The absolute exponent is at most `largest`, and at most `LARGEST_EXPONENT`. The other arguments are as of `update`.
     """
-    to = extrapolation or NO_EXTRAPOLATION
-    last, momentum, ahead = to.last, to.exponent, to.ahead
-    inputs = [volume, logarithm, blurred, float(share), float(largest), last, float(momentum)]
-    sweep_runs(_sharpen, inputs, [stepped, ahead])
+    momentum = extrapolation or NO_EXTRAPOLATION
+    inputs = [volume, logarithm, blurred, float(share), float(largest), momentum.last, float(momentum.exponent)]
+    sweep_runs(_sharpen, inputs, [stepped, momentum.ahead])
