@@ -1,4 +1,4 @@
-"""Some steps of conjugate gradients, for nodes of a displacement."""
+"""Some steps of the conjugate gradient method, for nodes of a displacement."""
 
 from __future__ import annotations
 
@@ -9,38 +9,39 @@ import numpy as np
 
 def conjugate_gradients(
     matrix: Callable[[np.ndarray], np.ndarray],
-    rest: np.ndarray,
+    right_side: np.ndarray,
     *,
     steps: int,
-    least: float,
-    inverse: np.ndarray | float = 1.0,
+    tolerance: float,
+    preconditioner: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """Return an approximate solution of matrix x = rest, started from zeros.
+    """Return an approximate solution x of matrix x = right_side, started from zeros.
 
     Parameters
     ----------
     matrix : callable
         Symmetric positive map of arrays.
-    rest : ndarray
+    right_side : ndarray
         Right-hand side.
     steps : int
         Largest number of steps.
-    least : float
+    tolerance : float
         Share of the first squared residual at which the steps end.
-    inverse : ndarray or float
-        Diagonal preconditioner.
+    preconditioner : ndarray or float
+        Approximate inverse of the matrix's diagonal.
     """
-    found, scaled = np.zeros_like(rest), inverse * rest
-    way, square = scaled.copy(), float((rest * scaled).sum())
-    least *= square
+    residual, scaled = right_side, preconditioner * right_side
+    solution, direction = np.zeros_like(residual), scaled.copy()
+    square = float((residual * scaled).sum())
+    least = tolerance * square
     for _ in range(steps):
         if square <= least:
             break
-        image = matrix(way)
-        length = square / float((way * image).sum())
-        found += length * way
-        rest = rest - length * image
-        scaled = inverse * rest
-        square, before = float((rest * scaled).sum()), square
-        way = scaled + (square / before) * way
-    return found
+        image = matrix(direction)
+        length = square / float((direction * image).sum())
+        solution += length * direction
+        residual = residual - length * image
+        scaled = preconditioner * residual
+        square, before = float((residual * scaled).sum()), square
+        direction = scaled + (square / before) * direction
+    return solution

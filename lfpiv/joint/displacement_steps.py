@@ -206,13 +206,13 @@ class DisplacementSteps:
         floor = LEAST_CURVATURE * float(scale.mean())
         near = model.field.adjoint(np.broadcast_to(light, (3, *light.shape)))
         near = np.maximum(near / near.mean(), LEAST_SHARE)
-        inverse = 1 / (scale * near + rough.mean(1)[:, None, None, None] * SECOND_DIFFERENCES + floor)
+        preconditioner = 1 / (scale * near + rough.mean(1)[:, None, None, None] * SECOND_DIFFERENCES + floor)
         change = conjugate_gradients(
-            lambda way: curvature(way) + model.field.penalty(way, rough) + floor * way,
+            lambda change: curvature(change) + model.field.penalty(change, rough) + floor * change,
             -(gradient + model.field.penalty(nodes, rough)),
             steps=steps,
-            least=SMALL_REST,
-            inverse=inverse,
+            tolerance=SMALL_REST,
+            preconditioner=preconditioner,
         )
         change *= relaxation
         largest = float(np.abs(model.field.values(change)).max())

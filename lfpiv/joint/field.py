@@ -63,8 +63,8 @@ def joint_field(volumes: Sequence[xr.DataArray], vectors: xr.Dataset) -> xr.Data
         variables[f"displacement_{axis}"] = _variable(displacement, "voxel", f"displacement along {axis}")
         variables[name] = _variable(1e-3 * edges[axis] / dt_s * displacement, "m/s", f"velocity along {axis}")
     slopes = {
-        f"{of}{along}": edges[of] / edges[along] / dt_s * _slope(moved[of], places, along)
-        for of in AXES
+        f"{component}{along}": edges[component] / edges[along] / dt_s * _slope(moved[component], places, along)
+        for component in AXES
         for along in AXES
     }
     for axis, (plus, minus) in _CURL.items():

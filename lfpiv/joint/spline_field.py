@@ -120,7 +120,7 @@ class SplineField:
             fitted = _along_axes(back, weight * _along_axes(means, nodes))
             return fitted + ROUGH_START * self.penalty(nodes) + SMALL * nodes
 
-        return conjugate_gradients(normal, _along_axes(back, weight * given), steps=STEPS_OF_FIT, least=SMALL**2)
+        return conjugate_gradients(normal, _along_axes(back, weight * given), steps=STEPS_OF_FIT, tolerance=SMALL**2)
 
 
 def window_shares(voxels_mm: np.ndarray, centres_mm: np.ndarray, edge_mm: float) -> np.ndarray:
