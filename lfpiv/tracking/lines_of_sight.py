@@ -54,7 +54,7 @@ class Line:
         score : ndarray, shape (place,)
             Squared residual that the light explains [noise^2], 0 at a place that some camera does not show.
         """
-        shown = np.stack([image @ of for image, of in zip(self.images, left, strict=True)], axis=1)
+        shown = np.stack([image @ residual for image, residual in zip(self.images, left, strict=True)], axis=1)
         light = np.maximum(shown, 0) / self.information
         root = np.sqrt(self.information)
         signal = light * root

@@ -199,20 +199,23 @@ def _matched(
     first: FoundParticles, second: FoundParticles, predicted: np.ndarray, spread_voxel: np.ndarray
 ) -> np.ndarray:
     """Return the links of particles about a prediction, shape (link, 2), in the order of the first particles."""
-    at = first.positions_mm / first.voxel_mm + predicted
-    to = second.positions_mm / first.voxel_mm
+    expected = first.positions_mm / first.voxel_mm + predicted
+    found = second.positions_mm / first.voxel_mm
     variances = [np.square(one.errors_mm / first.voxel_mm) for one in (first, second)]
-    return matched(at, to, (variances[0] + np.square(spread_voxel), variances[1]), (first.light, second.light))
+    return matched(expected, found, (variances[0] + np.square(spread_voxel), variances[1]), (first.light, second.light))
 
 
 def matched(
-    at: np.ndarray, to: np.ndarray, variances: tuple[np.ndarray, np.ndarray], lights: tuple[np.ndarray, np.ndarray]
+    predicted: np.ndarray,
+    found: np.ndarray,
+    variances: tuple[np.ndarray, np.ndarray],
+    lights: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Return unambiguous mutual best matches of predicted and found particles.
 
     Parameters
     ----------
-    at, to : ndarray, shape (predicted, 3) and (found, 3)
+    predicted, found : ndarray, shape (predicted, 3) and (found, 3)
         Positions [voxel].
     variances : tuple of ndarray, shapes as of the positions
         Variances of both [voxel^2].
@@ -224,19 +227,19 @@ def matched(
     ndarray, shape (link, 2)
         Numbers of both, in the order of the predicted particles.
     """
-    if not (len(at) and len(to)):
+    if not (len(predicted) and len(found)):
         return np.zeros((0, 2), int)
     widest = np.sqrt(variances[0].max() + variances[1].max())
-    near = cKDTree(at).sparse_distance_matrix(cKDTree(to), REACH * widest, output_type="coo_matrix")
+    near = cKDTree(predicted).sparse_distance_matrix(cKDTree(found), REACH * widest, output_type="coo_matrix")
     row, column = near.row, near.col
     variance = variances[0][row] + variances[1][column]
-    distance = (np.square(to[column] - at[row]) / variance).sum(1)
+    distance = (np.square(found[column] - predicted[row]) / variance).sum(1)
     ratio = np.log(np.maximum(lights[1][column], 1e-9) / np.maximum(lights[0][row], 1e-9))
     cost = distance + np.square(ratio / LIGHT_SPREAD) + np.log(variance).sum(1)
     close = distance < REACH**2
     row, column, cost = row[close], column[close], cost[close]
-    best_row, margin_row = _best(row, cost, len(at))
-    best_column, margin_column = _best(column, cost, len(to))
+    best_row, margin_row = _best(row, cost, len(predicted))
+    best_column, margin_column = _best(column, cost, len(found))
     entry = best_row[best_row >= 0]
     mutual = entry[best_column[column[entry]] == entry]
     clear = mutual[(margin_row[row[mutual]] > AMBIGUOUS) & (margin_column[column[mutual]] > AMBIGUOUS)]

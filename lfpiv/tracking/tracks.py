@@ -104,9 +104,9 @@ def _fitted(followed: TrackedParticles) -> State:
     order = np.argsort(length, kind="stable")  # tracks of about one length together
     for part in np.array_split(order, -(-count // FITTED_ROWS)) if count else ():
         measured = followed.measured(np.sort(part))
-        state, there = smooth(followed.motion, measured), measured.there
+        state, is_measured = smooth(followed.motion, measured), measured.is_measured
         rows = np.isin(followed.track, part)
-        mean[rows], variance[rows] = state.mean[there], state.variance[there]
+        mean[rows], variance[rows] = state.mean[is_measured], state.variance[is_measured]
     return State(mean, variance)
 
 

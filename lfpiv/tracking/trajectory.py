@@ -141,7 +141,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Measured positions of tracks, one row a track. Shorter tracks repeat their last position, see `there`."""
+    """Measured positions of tracks, one row a track. Shorter tracks repeat their last position, see `is_measured`."""
 
     time: np.ndarray
     """Shape (track, position) [instant], rising along a track until its end."""
@@ -161,7 +161,7 @@ class Measured:
         return cls(time=time[place], position=position[place], error=error[place], length=length)
 
     @property
-    def there(self) -> np.ndarray:
+    def is_measured(self) -> np.ndarray:
         """Positions that were measured, not repeated to fill a row, shape (track, position), bool."""
         return np.arange(self.time.shape[1]) < self.length[:, None]
 
@@ -186,11 +186,11 @@ def smooth(motion: Motion, measured: Measured) -> State:
     if not count:
         return State(np.zeros((*measured.time.shape, 3, 3)), np.zeros((*measured.time.shape, 3, 3, 3)))
     state = State.first(motion, measured.position[:, 0], measured.error[:, 0])
-    there, filtered, predicted = measured.there, [state], []
+    is_measured, filtered, predicted = measured.is_measured, [state], []
     for place in range(1, count):
         ahead = state.after(motion, measured.time[:, place] - measured.time[:, place - 1])
         corrected = ahead.measured(motion, measured.position[:, place], measured.error[:, place])
-        state = state.where(there[:, place], corrected)
+        state = state.where(is_measured[:, place], corrected)
         predicted.append(ahead)
         filtered.append(state)
     smoothed = [filtered[-1]]
@@ -202,7 +202,7 @@ def smooth(motion: Motion, measured: Measured) -> State:
         kept = np.eye(3) - gain @ moved
         variance = kept @ before.variance @ kept.swapaxes(2, 3)  # Joseph's form: no difference, so none below 0
         variance += gain @ (later.variance + added) @ gain.swapaxes(2, 3)
-        smoothed.append(later.where(there[:, place], State(mean, variance)))
+        smoothed.append(later.where(is_measured[:, place], State(mean, variance)))
     smoothed.reverse()
     return State(np.stack([one.mean for one in smoothed], 1), np.stack([one.variance for one in smoothed], 1))
 
@@ -221,14 +221,14 @@ def unlikeliness(motion: Motion, measured: Measured) -> np.ndarray:
     two positions of a track tell its velocity and do not count.
     """
     state = State.first(motion, measured.position[:, 0], measured.error[:, 0])
-    there, total = measured.there, np.zeros(measured.position.shape[2])
+    is_measured, total = measured.is_measured, np.zeros(measured.position.shape[2])
     for before, place in pairwise(range(measured.time.shape[1])):
         ahead = state.after(motion, measured.time[:, place] - measured.time[:, before])
         if place > 1:
             variance = ahead.variance[..., 0, 0] + np.square(measured.error[:, place] * motion.factor)
             square = np.square(measured.position[:, place] - ahead.mean[..., 0]) / variance
             cost = ((TAILS + 1) * np.log1p(square / TAILS) + np.log(variance)) / 2
-            total += np.where(there[:, place, None], cost, 0).sum(0)
+            total += np.where(is_measured[:, place, None], cost, 0).sum(0)
         state = ahead.measured(motion, measured.position[:, place], measured.error[:, place])
     return total
 
