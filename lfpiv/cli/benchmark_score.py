@@ -91,8 +91,8 @@ def score(
     if out is not None and out.suffix.lower() not in ENDINGS:
         raise InputError(f"--out {out}: expected a file that ends in {' or '.join(ENDINGS)}.")
     if out is not None and (not out.parent.is_dir() or out.is_dir()):
-        there = "a folder of that name" if out.is_dir() else f"no folder {out.parent}. Make it first"
-        raise InputError(f"--out {out}: expected a file in a folder that exists, found {there}.")
+        obstacle = "a folder of that name" if out.is_dir() else f"no folder {out.parent}. Make it first"
+        raise InputError(f"--out {out}: expected a file in a folder that exists, found {obstacle}.")
     selected = terminal.parse_pairs(pairs)
     with terminal.OUTPUT.progress() as progress:
         from lfpiv.benchmark import page

@@ -100,8 +100,8 @@ def missing(experiment: Experiment) -> Missing | None:
     if complete is None or not some:
         return None
     beyond, last = stated.stop in complete, max((one for one in some if one in stated), default=stated.start - 1)
-    there = sorted(one for one in complete if one in stated)
-    gaps = tuple(_gaps(there, range(stated.start, last + 1)))
+    present = sorted(number for number in complete if number in stated)
+    gaps = tuple(_gaps(present, range(stated.start, last + 1)))
     end = range(last + 1, stated.stop)
     lost = gaps[0][0] if gaps else end.start
     first = _first_missing(experiment, lost) if gaps or end else None
@@ -109,7 +109,7 @@ def missing(experiment: Experiment) -> Missing | None:
         return None
     from_one = beyond and not end and stated.start not in some
     return Missing(
-        experiment=experiment, stated=stated, complete=len(there), end=end, gaps=gaps, first=first,
+        experiment=experiment, stated=stated, complete=len(present), end=end, gaps=gaps, first=first,
         counts_from_one=from_one,
     )  # fmt: skip
 
@@ -118,13 +118,13 @@ def _numbers(noun: str, numbers: range) -> str:
     return f"{noun} {numbers[0]}" if len(numbers) == 1 else f"{noun}s {numbers[0]} to {numbers[-1]}"
 
 
-def _gaps(there: list[int], stated: range) -> Iterator[range]:
-    """Yield the ranges of stated numbers between and beside those that are there, in rising order."""
+def _gaps(present: list[int], stated: range) -> Iterator[range]:
+    """Yield the ranges of stated numbers between and beside those that are present, in rising order."""
     before = stated.start - 1
-    for one in [*there, stated.stop]:
-        if one > before + 1:
-            yield range(before + 1, min(one, stated.stop))
-        before = one
+    for number in [*present, stated.stop]:
+        if number > before + 1:
+            yield range(before + 1, min(number, stated.stop))
+        before = number
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 HOT_SIGMA = 5.0
-"""Count that is no noise, but a hot pixel [standard deviation of the noise]."""
+"""Least count of a hot pixel [standard deviation of the noise]."""
 LEAST_PIXELS = 100
-"""Least number of pixels that tell the noise. They tell it to 7 %."""
+"""Least number of pixels that the noise is measured from. They give it to 7 %."""
 
 
 def dark_noise(image: np.ndarray) -> float:

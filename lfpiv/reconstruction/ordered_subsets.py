@@ -87,7 +87,7 @@ class Subset:
 
     def sets_of(self, camera: int) -> list[int]:
         """Return the numbers of the sets of one camera's rays."""
-        return [ray_set for of, ray_set in self.parts if of == camera]
+        return [ray_set for number, ray_set in self.parts if number == camera]
 
 
 @dataclass(frozen=True)

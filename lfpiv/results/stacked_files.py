@@ -238,8 +238,8 @@ def _listed(folder: Path, pairs: tuple[int, int | None] | None) -> tuple[str, ar
     known = np.sort(np.array(found[dimension], np.int64))
     chosen = known[(known >= start) & (known < (np.iinfo(np.int64).max if stop is None else stop))]
     if not chosen.size:
-        there = f"{dimension}s {known[0]} to {known[-1]}" if known.size else "none"
-        raise InputError(f"{vectors}: expected finished {dimension}s {text}, found {there}.")
+        found_text = f"{dimension}s {known[0]} to {known[-1]}" if known.size else "none"
+        raise InputError(f"{vectors}: expected finished {dimension}s {text}, found {found_text}.")
     return dimension, array("q", chosen.tolist()), _WIDTHS[dimension]
 
 

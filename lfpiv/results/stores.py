@@ -113,8 +113,8 @@ def _chosen(results: xr.Dataset, dimension: str, pairs: tuple[int, int | None], 
     numbers = results[dimension].values
     which = np.flatnonzero((numbers >= start) & (numbers < (math.inf if stop is None else stop)))
     if not which.size:
-        wanted, there = f"{start}:{'' if stop is None else stop}", f"{numbers[0]} to {numbers[-1]}"
-        raise InputError(f"{path}: expected {dimension}s {wanted}, found {there}.")
+        wanted, found = f"{start}:{'' if stop is None else stop}", f"{numbers[0]} to {numbers[-1]}"
+        raise InputError(f"{path}: expected {dimension}s {wanted}, found {found}.")
     return results.isel({dimension: slice(int(which[0]), int(which[-1]) + 1)})
 
 

@@ -70,9 +70,9 @@ class FinishedPairs(Mapping[int, PairFigures]):
         order = np.lexsort((path, pair, content))
         pair, path, content = pair[order], path[order], content[order]
         first = np.flatnonzero(np.append(True, content[1:] != content[:-1])[: len(content)])
-        of = np.repeat(first, np.diff(np.append(first, len(content))))
-        again = np.flatnonzero((path != path[of]) & (pair != pair[of]))
-        return dict(sorted(((int(pair[item]), int(pair[of[item]])) for item in again), reverse=True))
+        original = np.repeat(first, np.diff(np.append(first, len(content))))
+        again = np.flatnonzero((path != path[original]) & (pair != pair[original]))
+        return dict(sorted(((int(pair[item]), int(pair[original[item]])) for item in again), reverse=True))
 
     def __getitem__(self, pair: int) -> PairFigures:
         if pair not in self:

@@ -211,8 +211,8 @@ def _fit_effects(equations: Sequence[Equations], effects: Effects, board: BoardE
         normal = NormalEquations.from_parts(parts, effects.kind, FIRST_STD)
         std = normal.best_std(std)
         solution = normal.solve(std)
-        for k, (camera, of) in enumerate(zip(equations, weighted, strict=True)):
-            residual = np.abs(of.residual(solution)) / np.sqrt(robust[k])
+        for k, (camera, of_camera) in enumerate(zip(equations, weighted, strict=True)):
+            residual = np.abs(of_camera.residual(solution)) / np.sqrt(robust[k])
             scatter = [NORMAL_MAD * np.median(residual[:, camera.kind == kind], axis=1) for kind in range(2)]
             scale = np.maximum(scatter, LEAST_NOISE_MM / noise[k])
             noise[k] = noise[k] * scale

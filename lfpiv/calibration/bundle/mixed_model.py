@@ -75,7 +75,7 @@ class NormalEquations:
             std = typical * np.exp(logarithm)
             found = self.solve(dict(zip(kinds, std, strict=True)))
             square = found.values**2 + found.covariance.diagonal()
-            rise = [square[of].sum() / s**2 - of.sum() for of, s in zip(members, std, strict=True)]
+            rise = [square[member].sum() / s**2 - member.sum() for member, s in zip(members, std, strict=True)]
             return -found.likelihood, -np.array(rise)
 
         first = np.clip(np.log(np.array(list(start.values())) / typical), *np.log(STD_RANGE))

@@ -57,7 +57,7 @@ class NodeGrid:
         rows, layers, columns = (self.stored.shape[axis] for axis in self.axes)
         layer, plane = np.arange(layers), self._plane
         share = np.stack(_lagrange((layer - self._first_layer) / self.distance - plane - 1), axis=-1)
-        low, high = (of.tolist() for of in self._aside)
+        low, high = (nodes.tolist() for nodes in self._aside)
         row_share, column_share = (
             line_shares(-part) if slope % 1 else np.ones((layers, 1))
             for slope, part in zip(self.slopes, self._parts(layer).T, strict=True)
@@ -158,8 +158,9 @@ class NodeGrid:
             model[:, 18 + 4 * depth : 22 + 4 * depth] /= self.distance
             of_planes = model.reshape(*self.shape[1:], -1)
             for axis, part in zip((world[0], world[2]), parts.T[:, :, None], strict=True):
-                for of in range(2):  # the point on the array and its slopes; they change linearly over a voxel
-                    place, edge, slope = 6 * of, 12 + 2 * axis + of, 18 + 4 * axis + 2 * of
+                for coordinate in range(2):  # the point on the array and its slopes; they change linearly over a voxel
+                    place, edge = 6 * coordinate, 12 + 2 * axis + coordinate
+                    slope = 18 + 4 * axis + 2 * coordinate
                     of_planes[..., place] += part * of_planes[..., edge]
                     of_planes[..., place + 1 : place + 3] += part[..., None] * of_planes[..., slope : slope + 2]
             yield model

@@ -183,7 +183,9 @@ def interpolation_errors(nodes: NodeGrid, sample: Sample, own: list[sparse.csr_a
         voxels, light = sample.voxels[part], sample.light[part]
         found = [nodes.shares.nodes_of(int(voxel)) for voxel in voxels.ravel()]
         used, place = np.unique(np.concatenate([node for node, _ in found]), return_inverse=True)
-        shares = np.concatenate([of * share for of, (_, share) in zip(light.ravel(), found, strict=True)])
+        shares = np.concatenate(
+            [brightness * share for brightness, (_, share) in zip(light.ravel(), found, strict=True)]
+        )
         first = np.cumsum([0, *(len(node) for node, _ in found)])[:: voxels.shape[1]]
         of_nodes = sparse.csr_array((shares, place, first), (len(voxels), len(used)))
         apart = exact - sample.images(nodes.centres_mm(used), nodes.voxel_mm, of_nodes)

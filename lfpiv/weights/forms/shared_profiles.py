@@ -77,7 +77,7 @@ class SharedProfiles(Form):
             if not one.possible:
                 log.debug("%s: a pixel sees too many voxels side by side for profiles of planes", name)
                 return ()
-        host, device = (sum(map(of, self.names)) for of in (self.host_bytes, self.device_bytes))
+        host, device = (sum(map(need, self.names)) for need in (self.host_bytes, self.device_bytes))
         if not rig.memory.holds(host, device):
             log.debug("profiles of planes do not fit the memory")
             return ()
