@@ -124,6 +124,7 @@ def _chosen(cases: Sequence[str], *, with_tracers: bool) -> list[Case]:
 
 
 def _make_or_keep(case: Case, scene: Scene, folder: Path, truth: Path, progress: Progress) -> Made:
+    """Make a case in its folders, unless they hold it already."""
     known = _made_before(case, scene, folder, truth)
     if known is not None:
         log.info("%s: made before, kept", case.name)

@@ -13,20 +13,20 @@ from lfpiv.settings.rig import Board, CameraTable
 from lfpiv.settings.volume import Box, HalfSpace
 
 SEEN_VOXELS = 32
-"""Places along the longest axis at which it is counted how many cameras see them."""
+"""Cells along the longest edge of the volume in which the cameras that see them are counted."""
 REACH = 2.0
-"""Length of the pyramids that are drawn towards the cameras, in diagonals of the volume."""
+"""Length of the drawn pyramids of view towards the cameras [diagonals of the volume]."""
 UNKNOWN_PIXELS = (2048, 2048)
-"""Sensor of a camera whose white image is not there yet, (rows, columns)."""
+"""Assumed sensor of a camera whose white image is missing, (rows, columns)."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A nominal camera as VTK knows cameras: in the middle of its main lens, looking at the origin [mm]."""
+    """A nominal camera for VTK: at the centre of its main lens, looking at the origin [mm]."""
 
     camera: pv.Camera
     aspect: float
-    """Columns of the sensor for each of its rows."""
+    """Columns of the sensor over its rows."""
 
     @classmethod
     def from_table(cls, table: CameraTable, shape: tuple[int, int]) -> View:
@@ -39,7 +39,7 @@ class View:
         return cls(camera, shape[1] / shape[0])
 
     def pyramid(self, length: float) -> pv.PolyData:
-        """Return the lines through the corners of what is seen, about the plane of focus, cut at a length before it."""
+        """Return the edges of the field of view, from a length [mm] in front of the plane of focus to behind it."""
         distance, parts = self.camera.distance, []
         share = min(1.0, length / distance)
         for near, far in ((max(1 - share, 1e-3), 1.0), (1.0, 1 + 0.35 * share)):
@@ -48,7 +48,7 @@ class View:
         return pv.merge(parts)
 
     def sees(self, points: np.ndarray) -> np.ndarray:
-        """Return which points lie in the pyramid of view, bool."""
+        """Return which points (n, 3) [mm] lie in the pyramid of view, shape (n,), bool."""
         planes = [0.0] * 24
         self.camera.GetFrustumPlanes(self.aspect, planes)
         sides = np.reshape(planes, (6, 4))[:4]
@@ -56,7 +56,7 @@ class View:
 
 
 def count_seen(views: list[View], centre: np.ndarray, size: np.ndarray) -> pv.ImageData:
-    """Return how many cameras see each place of the volume, as cells of a coarse grid."""
+    """Return the number of cameras that see each cell of a coarse grid; volume by centre and size [mm]."""
     counts = np.maximum(2, np.round(SEEN_VOXELS * size / size.max())).astype(int)
     grid = pv.ImageData(dimensions=counts + 1, spacing=size / counts, origin=centre - size / 2)
     points = np.asarray(grid.cell_centers().points, float)
