@@ -173,8 +173,8 @@ class MovementFit:
         projection: np.ndarray = (axes[:, kept] @ axes[:, kept].T) * scale / scale[:, None]
         return projection
 
-    def along(self, projection: np.ndarray) -> MovementFit:
-        """Return the part of the movements within a projection."""
+    def projected(self, projection: np.ndarray) -> MovementFit:
+        """Return the movements after a projection, shape (6 cameras, 6 cameras)."""
         return replace(self, values=projection @ self.values)
 
     def since(self, other: MovementFit) -> MovementFit:
@@ -282,7 +282,7 @@ def self_calibrate(
         fits.append(fit_movements(found[-1], list(movements), grid))
         if number == 0:  # later rounds refine what is significant in the first one
             shown = fits[0].significant_directions(reach_mm) if fits[0].separation.significant else 0 * fits[0].observed
-        step = fits[-1].along(shown)
+        step = fits[-1].projected(shown)
         if len(found) > ROUNDS or step.explained_mm < CONVERGED_VOXEL * grid.voxel_mm:
             break
         steps = step.movements
@@ -333,18 +333,19 @@ def fit_movements(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid
 
 
 def _fitted(found: Sequence[Disparity], cameras: Sequence[str], grid: Grid) -> MovementFit:
+    """Fit as `fit_movements` does, without the jackknife."""
     rows = [_row(one, cameras, grid) for one in found]
     count, least = len(cameras), LEAST_STD_VOXEL * grid.voxel_mm
     prior = np.diag(np.tile(np.repeat([PRIOR_MM**-2.0, PRIOR_RAD**-2.0], 3), count))
     assumed = (ASSUMED_STD_VOXEL * grid.voxel_mm) ** 2
     variance, trust = assumed, np.ones(len(found))
     for _ in range(FITS):  # each solution gives the variance, and the weights of outliers
-        information, pull = np.zeros_like(prior), np.zeros(6 * count)
+        information, right_side = np.zeros_like(prior), np.zeros(6 * count)
         for one, row, part in zip(found, rows, trust / variance, strict=True):
             information += part * row.T @ one.weight @ row
-            pull += part * row.T @ one.weight @ one.shift_mm
+            right_side += part * row.T @ one.weight @ one.shift_mm
         covariance = np.linalg.inv(information + prior)
-        values = covariance @ pull
+        values = covariance @ right_side
         residual = np.array(
             [one.observable_mm(one.shift_mm - row @ values) for one, row in zip(found, rows, strict=True)]
         )

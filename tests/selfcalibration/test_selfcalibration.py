@@ -133,7 +133,7 @@ def test_rigid_movements_explain_their_disparities(count):
         assert (fitted[name].std > 0).all() and (fitted[name].std[:3] < 0.01).all()
     told = np.sqrt(np.mean([one.shift_mm @ one.shift_mm for one in found]))
     assert fit.separation.mm == pytest.approx(told, rel=PRIOR_PULL) and fit.separation.significant
-    kept = fit.along(fit.significant_directions(1.0)).movements
+    kept = fit.projected(fit.significant_directions(1.0)).movements
     assert all(np.allclose(kept[name].shift_mm, true[name].shift_mm, atol=PRIOR_PULL * 0.1) for name in names)
 
 
@@ -304,7 +304,7 @@ def test_errors_of_disparities_are_no_movement(noise):
     for _ in range(200):
         found = [disparity_at(rng.uniform(-1, 1, 3), noise * rng.standard_normal(3)) for _ in range(10)]
         fit = movements.fit_movements(found, ["left", "right"], GRID)
-        kept = fit.along(fit.significant_directions(1.0)).movements.values()
+        kept = fit.projected(fit.significant_directions(1.0)).movements.values()
         shares.append((fit.separation.significant, any(np.any(move.shift_mm) for move in kept)))
     assert np.mean(shares, axis=0).max() < FALSE_ALARMS
     still = disparity_at(np.zeros(3), np.array([0, 0.2, 0]))
