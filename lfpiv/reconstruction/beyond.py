@@ -281,10 +281,12 @@ class _View:
         return np.moveaxis(lenses, -1, 1)
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
+        """Return blurred sub-aperture images, shape (pupil point, row, column)."""
         size = (0.0, self._blur_lenses, self._blur_lenses)
         return ndimage.gaussian_filter(values.astype(np.float32), size, mode="constant")
 
     def _at_cells(self, values: np.ndarray, number: int) -> np.ndarray:
+        """Return the values of sub-aperture image `number` at the cells, shape (z, y, x)."""
         sampled: np.ndarray = ndimage.map_coordinates(values, self._places[number], order=1, cval=0.0, prefilter=False)
         return sampled.reshape(self._shape)
 
@@ -327,14 +329,14 @@ def _profile(
     shifts = [sign * lag for lag in range(*SHIFTS) for sign in (1, -1)]
     different = group[:, None] != group[None, :]
     parts = []
-    for one, two in combinations(range(len(fluctuations)), 2):
-        both = layered((seen[one] & seen[two])[None].astype(np.float32))
-        first, second = layered(fluctuations[one]) * both, layered(fluctuations[two])
-        products_ = first @ np.swapaxes(second, 1, 2)
-        moved = [(first * layered(np.roll(fluctuations[two], shift, along))).sum(2) for shift in shifts]
+    for a, b in combinations(range(len(fluctuations)), 2):
+        both = layered((seen[a] & seen[b])[None].astype(np.float32))
+        first, second = layered(fluctuations[a]) * both, layered(fluctuations[b])
+        covariance = first @ np.swapaxes(second, 1, 2)  # layer, frame, frame
+        moved = [(first * layered(np.roll(fluctuations[b], shift, along))).sum(2) for shift in shifts]
         shifted = np.stack(moved, axis=2)  # layer, frame, shift
-        others = products_[:, different] if different.any() else shifted.reshape(len(both), -1)
-        same = np.einsum("lii->l", products_) / len(group) - others.mean(1)
+        others = covariance[:, different] if different.any() else shifted.reshape(len(both), -1)
+        same = np.einsum("lii->l", covariance) / len(group) - others.mean(1)
         mean, free = shifted.mean(1 if len(group) > 1 else (1, 2), keepdims=True), max(len(group) - 1, 1)
         chance = [others - others.mean(1, keepdims=True), (shifted - mean) * np.sqrt(len(group) / free)]
         parts.append((same, np.hstack([each.reshape(len(both), -1) for each in chance]), both.sum((1, 2))))
