@@ -23,11 +23,11 @@ from lfpiv.experiment.recording import Frame
 from lfpiv.files import writing
 from lfpiv.geometry.grid import Grid
 from lfpiv.records import read_json, validate
-from lfpiv.results import datasets, netcdf, provenance
+from lfpiv.results import datasets, netcdf, provenance, stamps
 from lfpiv.results.folder import RETIRED, Folder, retire
 from lfpiv.results.particles import write_particles
 from lfpiv.results.provenance import Marks, Stamp
-from lfpiv.results.stamps import Inputs, of_pair
+from lfpiv.results.stamps import Inputs
 from lfpiv.warn import Warning
 
 
@@ -150,13 +150,13 @@ class PairFiles:
     @classmethod
     def for_pair(cls, experiment: Experiment, inputs: Inputs, folder: Folder, pair: int) -> PairFiles:
         """Return the files of a pair."""
-        stamps = of_pair(experiment, inputs, pair)
+        own = stamps.of_pair(experiment, inputs, pair)
         frames = experiment.pair_frames(pair)
         first, second = (
             VolumeFile(
                 frame=frames[number],
                 path=folder.volume(pair, number),
-                stamp=stamps.volumes[number],
+                stamp=own.volumes[number],
                 origin=experiment.recording.frame_origin(frames[number], experiment.dt_s),
                 grid=experiment.grid,
             )
@@ -165,11 +165,11 @@ class PairFiles:
         return cls(
             pair=pair,
             vectors=folder.vectors(pair),
-            stamp=stamps.vectors,
+            stamp=own.vectors,
             frames=(first, second),
             origin=experiment.recording.origin(pair, experiment.dt_s),
-            particles=None if stamps.particles is None else folder.particles(pair),
-            particles_stamp=stamps.particles,
+            particles=None if own.particles is None else folder.particles(pair),
+            particles_stamp=own.particles,
         )
 
     @cached_property
