@@ -379,7 +379,7 @@ def _flipped(known: str, kind: Kind) -> str:
     return next(name for name, flip in along.items() if flip == sides)
 
 
-def of_pair(experiment: Experiment, refusals: Iterable[Warning], pair: int) -> tuple[Warning, ...]:
+def refusals_of_pair(experiment: Experiment, refusals: Iterable[Warning], pair: int) -> tuple[Warning, ...]:
     """Return the refusals that concern a pair, as warnings about it."""
     found = (one for one in refusals if not (numbers := one.pairs or one.instants) or pair in numbers)
     return tuple(_numbered(experiment, replace(one, instants=()), pair) for one in found)

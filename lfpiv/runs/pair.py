@@ -137,7 +137,8 @@ class PairWork(FrameWork):
     def volumes(self, files: PairFiles, frames: Frames, progress: StepProgress) -> PairVolumes:
         """Return the volumes of a pair, with the refusals of the pair; raise as `Frames.volumes`."""
         both = frames.volumes(files, progress)
-        return replace(both, between=(*both.between, *belonging.of_pair(self.experiment, self.refusals, files.pair)))
+        refusals = belonging.refusals_of_pair(self.experiment, self.refusals, files.pair)
+        return replace(both, between=(*both.between, *refusals))
 
     def measure(
         self,

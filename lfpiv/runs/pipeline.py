@@ -102,7 +102,7 @@ def run(
         read = unchanged.look_at(current.experiment)
         checked = _check(current, current.unfinished(volumes=keep_volumes), workers, scheduler)
         if checked.failed is None and checked.pending.ahead():
-            rig.tell_vectors(current.experiment)
+            rig.log_vector_grid(current.experiment)
         calibrated = rig.calibrate(current)
         before, (current, prepared) = current, rig.prepare(current, calibrated.calibration)
         if not current.has_light_of(before):
@@ -184,7 +184,7 @@ def correlate(
                 "made with the present settings, found none. Run `lfpiv reconstruct` first."
             )
         if known:
-            rig.tell_vectors(current.experiment)
+            rig.log_vector_grid(current.experiment)
         calibration = rig.with_standing_light(current, calibrated.calibration)
         work = rig.pair_work(current, None, keep_volumes=False, calibration=calibration)
         done = Invocation(tried=_sequential(current, work, pending))

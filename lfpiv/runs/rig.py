@@ -190,8 +190,8 @@ def prepare(run: Run, board: Calibration) -> tuple[Run, Prepared]:
     return run, Prepared(board=board, calibration=calibration, self_calibration=self_calibration)
 
 
-def tell_vectors(experiment: Experiment) -> None:
-    """Log how many vectors a run will measure along each axis, and what too few of them leave out."""
+def log_vector_grid(experiment: Experiment) -> None:
+    """Log how many vectors a run will measure along each axis, and warnings if they are too few."""
     from lfpiv.velocity import vector_grid
 
     grid, correlation = experiment.grid, experiment.correlation
