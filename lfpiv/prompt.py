@@ -94,5 +94,5 @@ def number(value: float, digits: str = ".3g") -> str:
 
 
 def count(size: int, noun: str) -> str:
-    """Return a number of things."""
+    """Return a number with its noun: 1 pair, 5,000 pairs."""
     return f"{size:,} {noun}{'' if size == 1 else 's'}"

@@ -14,7 +14,6 @@ from lfpiv.quantities import significant
 __all__ = [
     "NONE",
     "asset",
-    "count",
     "details",
     "escape",
     "facts",
@@ -113,8 +112,3 @@ def general(value: float) -> str:
 def percent(share: float | None, digits: int = 0) -> str:
     """Format a share in percent."""
     return NONE if share is None or not np.isfinite(share) else f"{100 * share:.{digits}f} %"
-
-
-def count(value: int, noun: str) -> str:
-    """Format a count with its noun: 1 pair, 5,000 pairs."""
-    return f"{value:,} {noun}{'' if value == 1 else 's'}"

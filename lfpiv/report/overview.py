@@ -8,7 +8,7 @@ import numpy as np
 
 from lfpiv.experiment import axes
 from lfpiv.experiment.experiment import CameraSetup, Experiment
-from lfpiv.prompt import movement
+from lfpiv.prompt import count, movement
 from lfpiv.quantities import quantity
 from lfpiv.report import markup, verdicts
 from lfpiv.report.markup import number, percent
@@ -25,7 +25,7 @@ def head(experiment: Experiment) -> str:
     size = " × ".join(f"{n * voxel:g}" for n in (nx, ny, nz))
     apart = f"between {experiment.recording.exposure}s{experiment.recording.later}"
     return f'<h1 id="top">{markup.escape(experiment.name)}</h1>' + markup.paragraph(
-        f"Light-field PIV with {markup.count(len(experiment.cameras), 'camera')}, {size} mm (x, y, z), "
+        f"Light-field PIV with {count(len(experiment.cameras), 'camera')}, {size} mm (x, y, z), "
         f"{quantity(experiment.dt_s, 's')} {apart}. One voxel of {voxel:g} mm is "
         f"{quantity(voxel / 1000 / experiment.dt_s, 'm/s')}. "
         f"In the recorded pictures {axes.directions(experiment)}; {axes.handedness(experiment)}.",
@@ -136,7 +136,7 @@ def _recorded(experiment: Experiment, finished: int) -> tuple[str, str]:
         return "Image pairs", f"{finished:,} of {experiment.pairs:,} finished"
     return "Time series", (
         f"instants {frames[0]} to {frames[-1]}; vectors of {finished:,} of the {experiment.pairs:,} that have a "
-        f"partner {markup.count(recording.step, 'instant')} later"
+        f"partner {count(recording.step, 'instant')} later"
     )
 
 
@@ -150,7 +150,7 @@ def _joint(summary: Summary) -> str:
     if not tried:
         return ""
     fits = [joint for joint in tried if joint.fitted]
-    text = f"{markup.count(len(fits), 'pair')} of {len(summary.pairs):,}"
+    text = f"{count(len(fits), 'pair')} of {len(summary.pairs):,}"
     if fits:
         share, ratio = np.mean([fit.share for fit in fits]), np.median([fit.misfit_ratio for fit in fits])
         text += f"; {percent(float(share))} of the valid vectors; one moving volume explains both frames with "
@@ -166,7 +166,7 @@ def _links(summary: Summary) -> str:
     number, length = np.median([(found.number, found.length) for found in links], axis=0)
     incompressible = sum(found.form == "incompressible" for found in links)
     return (
-        f"{markup.count(len(links), 'pair')} of {len(summary.pairs):,}, the others by the correlation; {number:,.0f} "
+        f"{count(len(links), 'pair')} of {len(summary.pairs):,}, the others by the correlation; {number:,.0f} "
         f"links, structures of {length:.1f} voxel (medians), incompressible in {incompressible:,}"
     )
 
@@ -192,7 +192,7 @@ def _agreement(weights: WeightFigures, noun: str) -> str:
     text = weights.cameras
     corrected = weights.self_calibration
     if corrected is not None and corrected.verdict != "corrected":
-        pairs = markup.count(len(corrected.pairs), noun)
+        pairs = count(len(corrected.pairs), noun)
         text += f"{'; ' if text else ''}self-calibration by {pairs} changed nothing: {corrected.verdict}"
     elif corrected is not None:
         moved = ", ".join(
@@ -201,7 +201,7 @@ def _agreement(weights: WeightFigures, noun: str) -> str:
             for name, move in corrected.movements.items()
         )
         text += (
-            f"{'; ' if text else ''}self-calibrated by {markup.count(len(corrected.pairs), noun)}: "
+            f"{'; ' if text else ''}self-calibrated by {count(len(corrected.pairs), noun)}: "
             f"{number(corrected.disparity_before_voxel, 2)} voxel before, "
             f"{number(corrected.disparity_voxel, 2)} after; {moved}"
         )
@@ -224,7 +224,7 @@ def _damping(damping: DampingFigures | None) -> str:
     harder = "" if alike else "not taken off, since simulated pairs are harder to measure than recorded ones; "
     return (
         f"{harder}slope of measured on true fluctuations, from "
-        f"{markup.count(damping.simulated, 'simulated pair')}: {slopes}; "
+        f"{count(damping.simulated, 'simulated pair')}: {slopes}; "
         f"offset [voxel]: {offsets}. This report shows the raw vectors; open_results has both"
     ).replace("-", "−")
 

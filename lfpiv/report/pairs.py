@@ -10,6 +10,7 @@ from typing import SupportsFloat
 import numpy as np
 
 from lfpiv.experiment.recording import Recording
+from lfpiv.prompt import count
 from lfpiv.quantities import Scale, scale_of, significant
 from lfpiv.report import markup
 from lfpiv.report.fields import evenly
@@ -125,9 +126,9 @@ def section(
 def _overview(pairs: Sequence[PairFigures], failed: Sequence[int], finished: int, noun: str) -> str:
     """Count the pairs and state their mean and lowest valid share."""
     shares = np.array([pair.valid_fraction for pair in pairs])
-    text = f"{markup.count(finished, noun)} finished"
+    text = f"{count(finished, noun)} finished"
     text += f", of which {len(pairs):,}, evenly chosen, are shown here" if len(pairs) < finished else ""
-    text += f", {markup.count(len(failed), noun)} failed" if failed else ""
+    text += f", {count(len(failed), noun)} failed" if failed else ""
     if len(pairs) == 1:
         return f"{text}: statistics over {noun}s need two or more."
     worst = int(shares.argmin())

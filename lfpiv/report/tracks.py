@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.collections import LineCollection
 
 from lfpiv.geometry.names import COMPONENTS, PARTICLE
+from lfpiv.prompt import count
 from lfpiv.quantities import scale_of
 from lfpiv.report import markup, svg
 from lfpiv.report.markup import significant
@@ -28,14 +29,14 @@ def section(figures: TrackFigures | None, folder: Path) -> str:
     head = "<h3>Tracks</h3>"
     table = open_tracks(folder)
     if not figures.tracks:
-        text = f"None of the particles was followed long enough; {markup.count(figures.left_out, 'track')} left out."
+        text = f"None of the particles was followed long enough; {count(figures.left_out, 'track')} left out."
         return head + markup.paragraph(text)
     valid = table.isel({PARTICLE: table["valid"].values})
     chosen = _drawn(valid)
     shown = valid.isel({PARTICLE: np.isin(valid["track"].values, chosen)})
     text = (
-        f"{markup.count(figures.tracks, 'particle')} followed over several instants, with {figures.rows:,} positions; "
-        f"{markup.count(figures.left_out, 'track')}, too short or unlike the neighbours, left out. "
+        f"{count(figures.tracks, 'particle')} followed over several instants, with {figures.rows:,} positions; "
+        f"{count(figures.left_out, 'track')}, too short or unlike the neighbours, left out. "
         "The file tracks.nc has all of them."
     )
     caption = "Tracks from two sides; a dot marks the end of each."

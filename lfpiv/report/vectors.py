@@ -13,6 +13,7 @@ import xarray as xr
 
 from lfpiv.experiment.recording import Recording
 from lfpiv.geometry.names import COMPONENTS
+from lfpiv.prompt import count
 from lfpiv.quantities import Scale
 from lfpiv.report import flow, markup
 from lfpiv.report.fields import Survey, embed, survey
@@ -269,7 +270,7 @@ def damping_table(damping: DampingFigures | None) -> str:
     text = (
         "Slope of measured on true fluctuations, their offset, and the expected root mean square errors of raw vectors "
         "and of those without damping, from "
-        f"{markup.count(damping.simulated, 'simulated pair')}. This page shows the raw vectors; open_results has both."
+        f"{count(damping.simulated, 'simulated pair')}. This page shows the raw vectors; open_results has both."
     )
     titles = [
         "component",
