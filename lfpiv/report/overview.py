@@ -41,7 +41,7 @@ def verdict(experiment: Experiment, summary: Summary) -> str:
 def warnings(summary: Summary, noun: str = "pair") -> str:
     """List the failed pairs, or instants as `noun` says, then the warnings."""
     failed = [f"{noun.capitalize()} {failure.pair} failed: {failure.reason}" for failure in summary.failed]
-    unnamed = summary.failed_count - len(failed)
+    unnamed = summary.pairs_failed - len(failed)
     failed += [f"{unnamed:,} more {noun}s failed"] if unnamed else []
     texts = [*failed, *summary.warnings]
     if not texts:
@@ -102,7 +102,7 @@ def run_facts(experiment: Experiment, summary: Summary) -> str:
             f"from z = {markup.general(min(board.planes_mm))} to {markup.general(max(board.planes_mm))} mm"
             + (f", with a mark of {len(board.mark)} places without a dot" if board.mark else ""),
         ),
-        _recorded(experiment, summary.finished_count),
+        _recorded(experiment, summary.pairs_finished),
         ("Joint fit", _joint(summary)),
         ("Vectors from links", _links(summary)),
         ("Weights", _weights(summary.weights)),

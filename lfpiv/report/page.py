@@ -68,7 +68,7 @@ def write_report(
     """
     figures = Summary.model_validate(summary)
     recording = experiment.recording
-    every = pairs.section(figures.pairs, figures.failed, figures.finished_count, recording) if figures.pairs else ""
+    every = pairs.section(figures.pairs, figures.failed, figures.pairs_finished, recording) if figures.pairs else ""
     raw = raw_image.figure(experiment, figures.pairs[0].number) if figures.pairs else ""
     sections = {
         "truth": known_flow.section(experiment, vectors),

@@ -80,7 +80,7 @@ def _known(reduce: Callable[[np.ndarray], SupportsFloat], values: np.ndarray) ->
 def section(
     pairs: Sequence[PairFigures],
     failures: Sequence[Failure],
-    finished: int | None,
+    finished: int,
     recording: Recording,
 ) -> str:
     """Return the section on all pairs, as HTML.
@@ -91,8 +91,8 @@ def section(
         Finished pairs; at least one.
     failures : sequence of Failure
         Pairs without result, marked in the charts.
-    finished : int or None
-        Number of all finished pairs, where `pairs` is an evenly chosen part of them. None: all are given.
+    finished : int
+        Number of all finished pairs, of which `pairs` may be an evenly chosen part.
     recording : Recording
         What was recorded; it names results.
     """
@@ -102,7 +102,7 @@ def section(
     single, noun = bool((groups.pairs == 1).all()), recording.noun
     parts = [
         f'<h2 id="pairs">All {noun}s</h2>',
-        markup.paragraph(_overview(pairs, failed, finished or len(pairs), noun)),
+        markup.paragraph(_overview(pairs, failed, finished, noun)),
     ]
     table, tracked = _table(groups, single, noun), particle_table(pairs, noun)
     if len(pairs) == 1:

@@ -74,15 +74,20 @@ class JointFigures(_Figures):
 
     fitted: bool = False
     misfit_ratio: float = 1.0
+    """Misfit over that of the frames by themselves."""
     share: float = 0.0
+    """Share of the valid vectors that are means of the fitted displacement."""
 
 
 class LinkFigures(_Figures):
     """Process through the links of a pair whose means are its vectors."""
 
     number: int
+    """Links that count."""
     form: str
+    """``incompressible``, or ``independent`` components."""
     length: float
+    """Length of the flow's structures [voxel]."""
 
 
 class ParticleFigures(_Figures):
@@ -202,21 +207,11 @@ class Summary(_Figures):
     """None without tracks."""
     pairs: tuple[PairFigures, ...]
     """Finished pairs; of very many an evenly chosen part."""
-    pairs_finished: int | None = None
-    """Number of all finished pairs; None in summaries that list all."""
+    pairs_finished: int
+    """Number of all finished pairs."""
     failed: tuple[Failure, ...] = ()
-    pairs_failed: int | None = None
-    """Number of all failed pairs; None in summaries that list all."""
+    pairs_failed: int
+    """Number of all failed pairs; `failed` lists the first of them."""
     valid_fraction: float | None
     warnings: tuple[str, ...]
     reused: tuple[str, ...]
-
-    @property
-    def finished_count(self) -> int:
-        """Number of all finished pairs."""
-        return len(self.pairs) if self.pairs_finished is None else self.pairs_finished
-
-    @property
-    def failed_count(self) -> int:
-        """Number of all failed pairs."""
-        return len(self.failed) if self.pairs_failed is None else self.pairs_failed

@@ -63,7 +63,7 @@ def tiles(experiment: Experiment, summary: Summary) -> list[Tile]:
 
 def _tiles(experiment: Experiment, summary: Summary) -> Iterator[Tile]:
     yield _pairs(summary, experiment.noun)
-    if summary.finished_count:
+    if summary.pairs_finished:
         yield _below_is_bad(
             summary.valid_fraction,
             "valid vectors",
@@ -100,7 +100,7 @@ def _tiles(experiment: Experiment, summary: Summary) -> Iterator[Tile]:
 
 def _pairs(summary: Summary, noun: str) -> Tile:
     """Judge how many pairs are finished of those that were tried."""
-    finished, failed = summary.finished_count, summary.failed_count
+    finished, failed = summary.pairs_finished, summary.pairs_failed
     level = Level.GOOD if not failed else Level.LOOK if failed < finished else Level.BAD
     done = f"{finished:,}" if not failed else f"{finished:,} of {finished + failed:,}"
     return Tile(

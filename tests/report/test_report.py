@@ -98,7 +98,8 @@ def text(reported):
 
 
 def figures(summary):
-    return Summary.model_validate(summary)
+    counts = {"pairs_finished": len(summary["pairs"]), "pairs_failed": len(summary["failed"])}
+    return Summary.model_validate(summary | counts)
 
 
 def unpacked(text, name):
@@ -235,7 +236,7 @@ def test_size_and_reading_are_bounded_for_thousands_of_pairs(reported, text, mon
                 overview.verdict(reported.experiment, summary),
                 vectors.section(paths, Recording(), None),
                 volumes.section(summary.pairs, paths, Recording()),
-                pairs_section.section(summary.pairs, summary.failed, None, Recording()),
+                pairs_section.section(summary.pairs, summary.failed, len(summary.pairs), Recording()),
             ]
         )
         assert (
@@ -509,7 +510,7 @@ def test_a_light_sheet_with_soft_edges_is_found(sides):
 
 def test_a_report_before_any_pair_is_finished(reported, tmp_path, monkeypatch):
     monkeypatch.setattr("lfpiv.report.calibration.section", lambda *parts: "")  # tested elsewhere
-    nothing = reported.summary | {"pairs": [], "valid_fraction": None}
+    nothing = reported.summary | {"pairs": [], "pairs_finished": 0, "valid_fraction": None}
     page = Page(reported.write(tmp_path / "none.html", summary=nothing, vectors={}))
     assert "No pair is finished yet." in page.text["p"] and not page.all("canvas")
 

@@ -151,8 +151,10 @@ def make_summary(experiment: Experiment, calibration: Calibration, vectors: dict
         "calibration": {name: camera.report.to_json() for name, camera in calibration.cameras.items()},
         "weights": {"method": "footprint", "memory_mib": 3.0, "form": {"left": "profiles"}, "count_check_l2": [0.01]},
         "pairs": pairs,
+        "pairs_finished": len(pairs),
         "valid_fraction": float(np.mean([pair["valid_fraction"] for pair in pairs])),
         "warnings": [f"left: {EVIL}"],
         "failed": [{"pair": 7, "reason": EVIL}],
+        "pairs_failed": 1,
         "reused": ["calibration"],
     }
