@@ -215,7 +215,7 @@ def lens_table() -> str:
     lines = [titles, tuple("---" for _ in titles)]
     for lens, row in sorted(rows.items(), key=lambda item: list(NAMES).index(item[0])):
         mapping = (f"{row['mapping'][part]:.4f}" for part in ("inner", "whole", "stated"))
-        moved = ("{:.3f} ± {:.3f}".format(*row["displacement"][way]) for way in ("correlation", "joint"))
+        moved = ("{:.3f}\u00a0±\u00a0{:.3f}".format(*row["displacement"][way]) for way in ("correlation", "joint"))
         lines.append((NAMES[lens], *mapping, f"{100 * row['weights']:.1f} %", str(row["pairs"]), *moved))
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
