@@ -55,7 +55,7 @@ class DotRays:
         parts = [labels for labels, chosen in zip(labels_of, enough, strict=True) if chosen]
         terms = _pupil_terms(dots.pupil_mm / radius)
         bases = [np.linalg.qr(terms[part, :6]) for part in parts]
-        beyond = [without(basis.Q, np.hstack([terms[part, 6:], dots.array_mm[part]]))
+        beyond = [orthogonal_part(basis.Q, np.hstack([terms[part, 6:], dots.array_mm[part]]))
                   for part, basis in zip(parts, bases, strict=True)]  # fmt: skip
         stacked = np.concatenate([np.empty((0, terms.shape[1] - 4)), *beyond])
         shared = np.linalg.lstsq(stacked[:, :-2], stacked[:, -2:], rcond=None)[0]
@@ -84,7 +84,7 @@ def _pupil_terms(pupil: np.ndarray) -> np.ndarray:
     return np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=1)
 
 
-def without(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def orthogonal_part(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the part of columns that is orthogonal to a basis."""
     return columns - basis @ (basis.T @ columns)
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from lfpiv.calibration.board.dots import DotBoard
 from lfpiv.calibration.board.errors import BoardErrors
-from lfpiv.calibration.bundle.dot_rays import CameraLabels, DotRays, smooth_terms, thin_lens_rays, without
+from lfpiv.calibration.bundle.dot_rays import CameraLabels, DotRays, orthogonal_part, smooth_terms, thin_lens_rays
 from lfpiv.calibration.bundle.effects import Effects
 from lfpiv.calibration.bundle.mixed_model import NormalEquations, Solution
 from lfpiv.lightfield.decoder import NORMAL_MAD
@@ -179,8 +179,10 @@ class WeightedEquations:
             left, strength, _ = np.linalg.svd(system.smooth * root[:, None], full_matrices=False)
             roots.append(root)
             bases.append(left[:, strength > RANK_TOLERANCE * strength[0]])
-        effects = [without(*part) for part in zip(bases, system.effects * np.stack(roots)[..., None], strict=True)]
-        departure = [without(*part) for part in zip(bases, system.departure * roots, strict=True)]
+        effects = [
+            orthogonal_part(*part) for part in zip(bases, system.effects * np.stack(roots)[..., None], strict=True)
+        ]
+        departure = [orthogonal_part(*part) for part in zip(bases, system.departure * roots, strict=True)]
         return cls(bases=tuple(bases), effects=np.stack(effects), departure=np.stack(departure))
 
     def residual(self, solution: Solution) -> np.ndarray:
