@@ -2,7 +2,8 @@
 
 The white image tells which pixels are lit, the volume of the other cameras where they would show particles. Regions
 beyond a light sheet stay dark in that projection, too. How far image and projection differ in the rest of the same
-sensor is the measure of chance: it grows where particles are few or unequal.
+sensor is the measure of chance: it grows where particles are few or unequal. Besides, so few particles may miss a
+region by chance: their number is counted in the images.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from lfpiv.reconstruction.settings import PLAIN, SmartSettings
 from lfpiv.reconstruction.solver import SmartSolver
@@ -35,6 +37,8 @@ BLOCK = 3
 """Edge of the blocks whose scatter is measured [cell]: the light of a particle reaches over neighbouring cells."""
 BRIGHTEST = 99.9
 """Percentile to which counts are limited, so that hot pixels have no weight."""
+CHANCE = 0.01
+"""Largest number of rectangles that counted particles miss by chance, as far as they miss a dark part."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,18 @@ class DarkPart:
     """First and last pixel."""
     lack: float
     """Missing light [standard errors]."""
+    share: float
+    """Share of the sensor's expected light that the region would show."""
+    seen: float
+    """Share of the sensor's light that it shows."""
+    rectangles: int
+    """Number of rectangles with this share or more that might be dark by chance. Of those that differ in their last
+    column only, the smallest one counts."""
+
+    def by_chance(self, particles: float) -> float:
+        """Return how many rectangles so many particles miss by chance, as far as they miss this one."""
+        missed = stats.binom.cdf(round(self.seen * particles), round(particles), self.share)
+        return self.rectangles * float(missed)
 
 
 class _Cells:
@@ -81,13 +97,32 @@ class _Cells:
         seen = np.minimum(seen, np.percentile(seen, BRIGHTEST))
         return np.bincount(self._cell, seen, self._shape[0] * self._shape[1]).reshape(self._shape)
 
+    def particles(self, images: Sequence[np.ndarray]) -> float:
+        """Return the number of particles of equal light that images show; a particle that rests counts once.
+
+        Light counts as far as it exceeds the median. Images of particles that overlap count less, so that dense seeding
+        gives a lower bound.
+        """
+        seen = [image.ravel()[self._pixels] for image in images]
+        lit = [light for one in seen if (light := np.maximum(one - np.median(one), 0)).any()]
+        apart = np.zeros(self.weights.grid.shape, np.float32)
+        for corner, (y, x) in enumerate(np.ndindex(2, 2)):
+            quarters = (1 + 2 * (corner in (1, 2)), 1 + 2 * y, 1 + 2 * x)
+            apart[tuple(size * far // 4 for size, far in zip(apart.shape, quarters, strict=True))] = 1
+        particle = _spread(self.weights(apart)[self.camera].ravel()[self._pixels]) / 4
+        if not lit or not particle:
+            return 0.0
+        some = np.any(lit, axis=0)
+        alike = np.maximum(np.corrcoef([light[some] for light in lit]), 0).sum()
+        return float(sum(map(_spread, lit)) * len(lit) / (alike * particle))
+
     def darkest(self, seen: np.ndarray, expected: np.ndarray) -> DarkPart | None:
         """Return the rectangle of cells that lacks most light, if one is dark.
 
         Roots make cells alike whose particles are unequal. Light outside a rectangle gives the scale of the projection.
         """
         rows, columns = (np.triu_indices(size + 1, 1) for size in self._shape)
-        share = _sums(expected, rows, columns) / expected.sum()
+        share, shown = (_sums(light, rows, columns) / light.sum() for light in (expected, seen))
         seen, expected = (np.sqrt(np.maximum(light, 0)) for light in (seen, expected))
         inside, due = (_sums(light, rows, columns) for light in (seen, expected))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -110,7 +145,15 @@ class _Cells:
             rows=(int(self._edges[0][top]), int(self._edges[0][bottom]) - 1),
             columns=(int(self._edges[1][left]), int(self._edges[1][right]) - 1),
             lack=float(lack[at] / chance) if chance > 0 else np.inf,
+            share=float(share[at]),
+            seen=float(shown[at]),
+            rectangles=sum(int((share[:, columns[0] == first] >= share[at]).any(1).sum()) for first in set(columns[0])),
         )
+
+
+def _spread(light: np.ndarray) -> float:
+    """Return the number of pixels of equal light that would scatter as much about zero."""
+    return float(light.sum(dtype=float) ** 2 / np.square(light).sum(dtype=float)) if light.any() else 0.0
 
 
 def _sums(light: np.ndarray, rows: tuple[np.ndarray, ...], columns: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -135,8 +178,9 @@ def find(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[DarkPart]:
     """
     cells = {name: _Cells(weights, name) for name in weights.cameras}
     seen = {name: np.zeros(()) for name in cells}
-    expected, solvers, clear = dict(seen), dict[str, SmartSolver](), list[DarkPart]()
+    expected, solvers, clear, used = dict(seen), dict[str, SmartSolver](), list[DarkPart](), list[Images]()
     for number, pair in enumerate(pairs):
+        used.append(pair[0])
         for name in solvers if number else cells:
             seen[name] = seen[name] + sum(cells[name].light(images[name]) for images in pair)
         if not number:
@@ -146,6 +190,8 @@ def find(weights: Weights, pairs: Iterable[Sequence[Images]]) -> list[DarkPart]:
                 expected[name] = expected[name] + cells[name].projected(volume)
         found = [part for name in solvers if (part := cells[name].darkest(seen[name], expected[name]))]
         clear = [part for part in found if part.lack > CLEAR and _stands_out(part, found)]
+        particles = {one.camera: cells[one.camera].particles([images[one.camera] for images in used]) for one in clear}
+        clear = [one for one in clear if one.by_chance(particles[one.camera]) < CHANCE]
         if clear or not any(STANDS_OUT * part.lack > CLEAR for part in found):
             break
     return clear

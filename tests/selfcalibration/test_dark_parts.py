@@ -15,6 +15,8 @@ PARTICLES = 2e-2
 """Particles per voxel."""
 SEEDED = 0.6
 """Part of the volume's width that holds particles."""
+FEW, MANY, SETS = 8, 100, 6
+"""Numbers of particles in an image, and number of images with few of them that are judged one by one."""
 WIDER = 1.5
 """Width of a volume that particles do not fill, over their own."""
 
@@ -89,3 +91,18 @@ def test_a_part_of_the_volume_without_particles_is_not_dark_although_other_views
         lit[:, :, int(SEEDED * shape[2]) :] = False
         frames.append({name: 1e3 * image for name, image in weights(lit.astype(np.float32)).items()})
     assert not find(weights, [frames])
+
+
+def test_a_region_that_few_particles_miss_by_chance_is_not_dark(weights):
+    """Few particles leave a tenth of a sensor without light by chance. A dark third is still found by three pairs."""
+    rng = np.random.default_rng(7)
+
+    def shown(particles):
+        places = rng.integers(0, weights.grid.shape, (particles, 3))
+        lit = np.zeros(weights.grid.shape, np.float32)
+        lit[tuple(places.T)] = 1
+        return {name: 1e3 * image for name, image in weights(lit).items()}
+
+    assert not any(find(weights, [[shown(FEW)]]) for _ in range(SETS))
+    (found,) = find(weights, darkened([[shown(MANY)] for _ in range(3)], "left", np.s_[:, 267:]))
+    assert found.camera == "left"
