@@ -24,7 +24,7 @@ INNER = 0.9
 
 _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
-_CLEAR = 1.5  # root mean square over the zones of displacements in standard errors that is told; 1 by chance
+_CLEAR = 1.5  # root mean square over the zones of their rings' displacements in standard errors that is told
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
 _ROUNDING = 1e-6  # least variance of an error, as a share of the largest
 _LEAST_SHARE = 1e-10  # least variance of displacements that is tried, as a share of the prior's: a millionth of a pitch
@@ -45,8 +45,9 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
     Returns
     -------
     ndarray, shape (PARTS, ZONES, 2)
-        Mean displacement of the rays [mm]. All are zero unless the zones of a part, or of the whole field, are together
-        displaced by more than their errors, and one by more than what hardly matters.
+        Mean displacement of the rays [mm]. All are zero unless the rings of a part, or of the whole field, are together
+        displaced by more than their errors, and a zone by more than what hardly matters. A ring's displacement is the
+        median of its zones: a lens bends rays all around, while the pupil's edge cuts the pixels of single zones.
     """
     found = np.zeros((PARTS, ZONES, 2))
     if len(fits) < _FEWEST:
@@ -61,11 +62,17 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
         mean, scatter, noise = _displacement(pull[here], information[here], pitch_mm)
         error = np.sqrt(np.maximum(np.diag(scatter), np.diag(noise)))
         size, limit = (np.linalg.norm(one.reshape(2, ZONES), axis=0) for one in (mean, error))
-        sure = float(np.sqrt(np.mean((size / limit) ** 2))) > _CLEAR
+        sure = float(np.sqrt(np.mean(_of_rings(size / limit) ** 2))) > _CLEAR
         clear |= sure and bool(size.max() > _LEAST_PITCHES * pitch_mm)
         if part < PARTS:
             found[part] = mean.reshape(2, ZONES).T
     return found if clear else np.zeros_like(found)
+
+
+def _of_rings(values: np.ndarray) -> np.ndarray:
+    """Return, for each zone, the median of the zones that are as far from the pupil's middle, shape (ZONES,)."""
+    ring = np.unique(np.linalg.norm(zone_middles(), axis=1).round(6), return_inverse=True)[1]
+    return np.array([np.median(values[ring == one]) for one in ring])
 
 
 def shared_error(fits: Sequence[DotFit], left_over_mm: np.ndarray, pitch_mm: float) -> float:
