@@ -16,8 +16,6 @@ from lfpiv.errors import InputError, printable
 from lfpiv.records import RecordError, open_regular, read_object, read_text
 from lfpiv.results.folder import Folder
 
-HOSTS = ("127.0.0.1", "localhost")
-"""Names by which a browser of this machine asks."""
 DEEPEST = 3
 """Levels of folders below a given one that are searched for experiments and results."""
 MOST_FOLDERS = 5000
@@ -29,16 +27,13 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 def guard(token: str) -> Callable[[web.Request, Handler], Awaitable[web.StreamResponse]]:
-    """Return what refuses requests without the token, by other names of this machine, or from other pages.
-
-    The address of the page holds the token; a cookie keeps it afterwards.
-    """
+    """Return what refuses requests without the token or its cookie, by other names of this machine, or of others."""
 
     @web.middleware
     async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
         host = urlsplit(f"//{request.headers.get('Host', '')}")
         origin = request.headers.get("Origin")
-        if host.hostname not in HOSTS or (origin and urlsplit(origin).netloc != host.netloc):
+        if host.hostname not in ("127.0.0.1", "localhost") or (origin and urlsplit(origin).netloc != host.netloc):
             raise web.HTTPForbidden(text="lfpiv studio answers its own page only.")
         name, asked = f"lfpiv_{host.port}", request.query.get("token", "")
         known = (asked, request.cookies.get(name, ""))
@@ -66,13 +61,7 @@ class Places:
     root: Path
 
     def within(self, text: str | Path) -> Path:
-        """Return a path if it lies in the folder, links followed.
-
-        Raises
-        ------
-        InputError
-            If it lies outside.
-        """
+        """Return a path, links followed, if it lies in the folder; InputError if it lies outside."""
         path = (self.root / os.path.expanduser(text)).resolve()
         if not path.is_relative_to(self.root):
             raise InputError(f"{path}: expected a place in {self.root}. Start `lfpiv studio` with a folder above it.")
@@ -105,6 +94,13 @@ class Places:
     def results(self) -> list[Path]:
         """Return the folders of runs."""
         return list(filter(is_run, self.folders()))
+
+
+def root_of(given: Path) -> Path:
+    """Return the folder that may be looked at: a given folder, or the folder of a given file, run or store."""
+    from lfpiv.results.stores import is_store  # imports xarray, for which the browser does not wait
+
+    return given if given.is_dir() and not is_store(given) and not is_run(given) else given.parent
 
 
 def is_run(folder: Path) -> bool:

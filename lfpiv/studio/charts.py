@@ -34,7 +34,7 @@ def histogram(values: np.ndarray, bins: int = 60) -> tuple[np.ndarray, np.ndarra
     return np.repeat(edges, 2)[1:-1], np.repeat(count, 2)
 
 
-def title_of(name: str) -> str:
+def title_of(name: str, unit: str = "") -> str:
     """Return what people call a field, with its unit."""
-    text, unit = LABELS.get(name, (name.replace("_", " "), ""))
+    text, unit = LABELS.get(name, (name.replace("_", " "), "" if unit == "1" else unit.replace("^2", "²")))
     return f"{text} [{unit}]" if unit else text

@@ -5,6 +5,7 @@ trame-vtk encodes in other threads and looks later whether they are done. That t
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from typing import Any
 
@@ -16,6 +17,8 @@ LEAST_PX, HIDDEN_PX = 10, (450, 325)
 """Views of hidden tabs are smaller, and have this size: what is seen until a busy browser asks again is blurred."""
 MOVING_PX = 400_000
 """Largest number of pixels of a picture while it is turned or a slider moves; at rest the view's own number."""
+SENT = asyncio.Event()
+"""Set when the first picture was sent."""
 QUALITY = {True: 70, False: 95}
 """Quality of the JPEG of pictures that move, and of others."""
 
@@ -44,6 +47,7 @@ def _rendered(part: Any, options: dict[str, Any]) -> dict[str, Any]:
             renderer.GetActiveCamera().SetUseHorizontalViewAngle(columns < rows)
     picture = _drawn(window, min(1.0, (MOVING_PX / (columns * rows)) ** 0.5) if moving else 1.0, QUALITY[moving])
     window.lfpiv_drawn = (_changed(window), columns, rows)
+    SENT.set()
     return reply | {"image": picture, "memsize": len(picture)}
 
 

@@ -118,13 +118,7 @@ class Draft:
         return {}
 
     def save(self) -> None:
-        """Write the file.
-
-        Raises
-        ------
-        InputError
-            If a value is wrong, or the file was changed by another program since it was read.
-        """
+        """Write the file; InputError if a value is wrong, or another program changed it since it was read."""
         wrong = self.problems()
         if wrong:
             raise InputError(f"{self.path}: not saved. {next(f'{key}: {text}' for key, text in wrong.items())}")

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 LATTICE, DOT, ARROW, X_AXIS, Y_AXIS = "#37b24d", "#ffd43b", "#ff6b6b", "#ff6b6b", "#4dabf7"
 MARKED = {"saturated": "#ff922b", "hot": "#e64980"}
+BRIGHTEST = 1.2
+"""White of views, relative to their brightest parts: an even view is no blank."""
 MOST_MARKS = 3000
 """Largest number of pixels, dots or lenses that are marked."""
 
@@ -59,7 +61,6 @@ class Images:
         if what in ("experiment", "results", "saved"):
             self.raw = self.state.i_image = self.state.i_pupil = self.state.i_plane = None
             return self._open()
-        return None
 
     async def _open(self) -> None:
         """Read the experiment beside the page."""
@@ -111,7 +112,7 @@ class Images:
             s.i_top = float(image.max())
             s.i_low, s.i_high = (float(f"{v:.5g}") for v in np.percentile(sample, (1, 99.8)))
             s.i_marks = []
-            values, counts = charts.histogram(sample)
+            values, counts = charts.histogram(image)
             s.i_chart = charts.chart({"": (values, np.log10(1 + counts))}, "counts", "log10(pixels)")
         with self.session.busy("i_busy", "finding the microlenses"):
             found = await asyncio.to_thread(raw.calibrated, camera)
@@ -162,7 +163,7 @@ class Images:
     def _pupil(self, raw: RawImages) -> None:
         s = self.state
         view = raw.pupil_view(s.i_camera, s.i_name, (float(s.i_u), float(s.i_v)))
-        s.i_pupil_high = float(np.percentile(view, 99.7)) or 1.0
+        s.i_pupil_high = BRIGHTEST * float(np.percentile(view, 99.7)) or 1.0
         s.i_pupil = sent(view)
 
     def _refocus(self, raw: RawImages) -> None:
@@ -170,7 +171,7 @@ class Images:
         names = [camera for camera in s.i_cameras if s.i_name in raw.names(camera)]
         shown = [s.i_camera, *(name for name in names if name != s.i_camera)] if s.i_both else [s.i_camera]
         planes = [raw.refocused(camera, s.i_name, float(s.i_z)) for camera in shown[:2]]
-        planes = [plane / (float(np.percentile(plane, 99.7)) or 1.0) for plane in planes]
+        planes = [plane / (BRIGHTEST * float(np.percentile(plane, 99.7)) or 1.0) for plane in planes]
         if len(planes) == 2:  # red and cyan: what both see is white
             planes = [np.stack([planes[0], planes[1], planes[1]], axis=-1)]
         s.i_plane = sent(planes[0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Container, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,6 +17,15 @@ MOVING_ARROWS = 1500
 """Arrows that are drawn in time while something moves."""
 LONGEST_LINE, LINES, MOVING_LINES = 4.0, 200.0, 40.0
 """Longest streamline, and all of them together at rest and while something moves, in diagonals of the volume."""
+
+DERIVED: dict[tuple[str, ...], Callable[[xr.Dataset], xr.Dataset]] = {
+    tuple(f"vorticity_{part}" for part in ("magnitude", *"xyz")): lambda vectors: lfpiv.derived.vorticity(vectors),
+    ("q_criterion",): lambda vectors: lfpiv.derived.q_criterion(vectors).to_dataset(),
+    ("divergence",): lambda vectors: lfpiv.derived.divergence(vectors).to_dataset(),
+}
+"""Fields that are derived of vectors -> what derives them together."""
+BASIC = ("u", "v", "w", "valid", "uncertainty")
+"""Fields that a grid always has."""
 
 
 def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
@@ -31,23 +42,37 @@ def field_at(results: xr.Dataset, moment: str) -> xr.Dataset:
     return results.sel({dimension: int(moment)})
 
 
-def grid_of(vectors: xr.Dataset) -> pv.ImageData:
-    """Return vectors and what is derived of them as point data on an even grid [mm]."""
-    with ThreadPoolExecutor(1) as here:  # dask, where it is installed, would import its clusters to find none
-        vectors = vectors.load(scheduler=here)
+def names_of(vectors: xr.Dataset) -> list[str]:
+    """Return the names of the fields of vectors, and of those that are derived of them."""
+    fields = [str(name) for name, item in vectors.data_vars.items() if set(item.dims) == set("zyx")]
+    return ["speed", *fields, *(itertools.chain(*DERIVED) if min(vectors.sizes[axis] for axis in "xyz") > 2 else ())]
+
+
+def grid_of(vectors: xr.Dataset, names: Iterable[str] | None = None) -> pv.ImageData:
+    """Return `BASIC` fields of vectors and others, by default all, as point data on an even grid [mm]."""
     axes = [np.asarray(vectors[axis], float) for axis in "xyz"]
     steps = [np.ptp(axis) / (len(axis) - 1) if len(axis) > 1 else 1.0 for axis in axes]
     grid = pv.ImageData(dimensions=[len(axis) for axis in axes], spacing=steps, origin=[axis[0] for axis in axes])
-    fields = {name: item for name, item in vectors.data_vars.items() if set(item.dims) == set("zyx")}
-    if min(len(axis) for axis in axes) > 2:
-        fields |= dict(lfpiv.derived.vorticity(vectors).data_vars)
-        fields["q_criterion"] = lfpiv.derived.q_criterion(vectors)
-        fields["divergence"] = lfpiv.derived.divergence(vectors)
-    for name, field in fields.items():
-        grid[name] = np.ascontiguousarray(field.transpose("z", "y", "x"), np.float32).ravel()
+    add_fields(grid, vectors, [*BASIC, *(names_of(vectors) if names is None else names)])
     grid["velocity"] = np.column_stack([grid[name] for name in "uvw"])
     grid["speed"] = np.linalg.norm(grid["velocity"], axis=1)
     return grid
+
+
+def add_fields(grid: pv.ImageData, vectors: xr.Dataset, names: Iterable[str]) -> None:
+    """Read or derive fields that a grid does not have yet; vectors keep what was read of them."""
+    missing = {*names} & {*names_of(vectors)} - {*grid.array_names}
+    fields = {**read(vectors, missing).data_vars}
+    for derived, call in DERIVED.items():
+        fields |= {**call(read(vectors, BASIC)).data_vars} if missing & {*derived} else {}
+    for name, field in fields.items():
+        grid[str(name)] = np.ascontiguousarray(field.transpose("z", "y", "x"), np.float32).ravel()
+
+
+def read(vectors: xr.Dataset, names: Container[str]) -> xr.Dataset:
+    """Return some of the vectors' variables, in memory."""
+    with ThreadPoolExecutor(1) as here:  # dask, where it is installed, would import its clusters to find none
+        return vectors[[name for name in vectors.data_vars if str(name) in names]].load(scheduler=here)
 
 
 def trusted(grid: pv.ImageData, replaced: bool, uncertainty: float | None) -> pv.ImageData:
@@ -100,11 +125,7 @@ def surface(grid: pv.ImageData, field: str, level: float, colour: str) -> pv.Pol
 def arrows(
     grid: pv.ImageData, every: int, length: float, colour: str, flagged: bool = False, moving: bool = False
 ) -> pv.PolyData:
-    """Return arrows on every n-th vector along each axis, or on the replaced vectors among them.
-
-    The fastest arrow is as long as `length` distances of the arrows. While something moves at most `MOVING_ARROWS` are
-    drawn.
-    """
+    """Return arrows on every n-th vector, or on replaced ones; the fastest is `length` of their distances long."""
     step = every
     while moving and np.prod([-(-n // step) for n in grid.dimensions]) > MOVING_ARROWS:
         step += every

@@ -11,6 +11,8 @@ import pyvista as pv
 
 from lfpiv.studio import layers
 
+pv.vtk_verbosity("error")  # VTK warns where it finds no screen, and then draws without
+
 BACKGROUND = {"light": "white", "dark": "#16191d"}
 INK = {"light": "#202327", "dark": "#e6e8ea"}
 VIEWS = {"x": "yz", "y": "xz", "z": "xy", "oblique": "xy"}
@@ -18,8 +20,6 @@ REPLACED = "#8a8f98"
 """Colour of vectors that are replaced."""
 TICKS = (0.15, 0.35, 0.8)
 """Least sides, as shares of the longest, that have two ticks, three, and ticks at round numbers."""
-LINE_PX = 3
-"""Width of streamlines [pixel]."""
 CLOUDS: dict[str, Any] = {"particles": {"point_size": 4.0}, "tracks": {"line_width": 2.0}}
 """What is drawn as it is -> its style."""
 SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
@@ -79,7 +79,7 @@ def look_along(plotter: pv.Plotter, view: str, bounds: Any) -> None:
     if view not in "xyz":
         camera.azimuth, camera.elevation = 25.0, 20.0
     plotter.reset_camera(bounds=bounds, render=False)
-    camera.zoom(0.78)
+    camera.zoom(0.7)
     plotter.renderer.ResetCameraClippingRange()
 
 
@@ -113,7 +113,7 @@ class Picture:
     ) -> None:
         """Draw what differs from what is drawn; less of what would take long while something moves."""
         self.drawn["whole"] = whole  # its id names it as long as it lives
-        key = (id(whole), look.hide_replaced, look.uncertainty)
+        key = (id(whole), look.hide_replaced, look.uncertainty, *whole.array_names)
         grid = self._kept("trusted", key, lambda: layers.trusted(whole, look.hide_replaced, look.uncertainty))
         limits = look.limits or self.limits(whole, look.colour)
         cmap = look.colours or ("coolwarm" if look.colour in SIGNED else "viridis")
@@ -150,7 +150,7 @@ class Picture:
         self._layer(
             "lines", look.lines and (key, look.lines, shade),
             lambda: layers.stream_lines(grid, look.lines, look.colour, moving), moving, **paint,
-            line_width=LINE_PX, render_lines_as_tubes=True,
+            line_width=3, render_lines_as_tubes=True,
         )  # fmt: skip
         for name, style in CLOUDS.items():
             cloud = clouds.get(name) if getattr(look, name) else None
@@ -215,24 +215,9 @@ class Picture:
 
 
 def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tuple[int, int]) -> str:
-    """Return a program that draws a look of results as the studio does: ``picture.png``, then ``picture1.png``.
-
-    Parameters
-    ----------
-    look : Look
-    results : sequence of str
-        Folders of runs, or stores, a picture each.
-    title : str
-        Title of the colour scale.
-    camera
-        Position, focal point and direction upwards.
-    size : (int, int)
-        Columns and rows of the picture.
-    """
-    stated = [
-        (item.name, getattr(look, item.name)) for item in fields(look) if getattr(look, item.name) != item.default
-    ]
-    values = "".join(f"    {name}={value!r},\n" for name, value in stated)
+    """Return a program that draws folders of results, or stores, as they are seen, each as a PNG."""
+    stated = {item.name: getattr(look, item.name) for item in fields(look)}
+    values = "".join(f"    {name}={value!r},\n" for name, value in stated.items() if value != getattr(Look, name))
     clouds = [f'"{name}": cloud_of("{name}", results, LOOK.moment)' for name in CLOUDS if getattr(look, name)]
     chosen = f", pairs=({look.moment}, {look.moment} + 1)" if look.moment.isdigit() else ""  # others may be damaged
     return (

@@ -53,9 +53,9 @@ class Preview:
         self.grids: list[pv.ImageData | None] = [None, None]
         self.pictures = (look.Picture.empty((600, 600)), look.Picture.empty((600, 600)))
         self.pictures[1].plotter.camera = self.pictures[0].plotter.camera
-        self.state.update(dict.fromkeys(("t_windows", "t_busy", "t_before", "t_after", "t_voxels"), ""))
-        self.state.update({"t_pairs": 1, "t_plan": []})
-        session.on_change(self.draw, "t_plane", "t_colour", "theme")
+        words = dict.fromkeys(("t_windows", "t_busy", "t_before", "t_after", "t_voxels"), "")
+        self.state.update({**words, "t_pairs": 1, "t_plan": [], "t_depth": [-1.0, 1.0]})
+        session.on_change(self.draw, "t_z", "t_colour", "theme")
         session.on_change(self._tell_voxels, "t_coarser")
         session.listeners.append(self._changed)
         self._panel()
@@ -116,12 +116,17 @@ class Preview:
             answer = json.loads((await self._ask(["-m", "lfpiv.studio.trial"], json.dumps(request)))[-1])
             grid = layers.grid_of(lfpiv.open_results(Path(folder)).isel({"pair": 0}, missing_dims="ignore").squeeze())
         with self.state:
-            self.grids = [self.grids[1], grid]
+            if self.grids[1] is None:
+                self.state.t_z = grid.center[2]
+            self.grids, self.state.t_depth = [self.grids[1], grid], list(grid.bounds[4:])
             known = "uncertainty" in grid.point_data and np.isfinite(grid["uncertainty"]).any()
             uncertain = f", uncertainty {np.nanmedian(grid['uncertainty']):.3g} voxel" if known else ""
             valid = f"{100 * grid['valid'].mean():.1f} % of {grid.n_points:,} vectors valid"
             text = f"{valid}{uncertain}, {answer['seconds']} s"
             text += "" if answer["calibrated"] else "; nominal cameras, not calibrated yet"
+            stated, tried = (one.text.splitlines() for one in (self.session.edited, draft))
+            text += "".join(f"; without {line}" for line in stated if line not in tried)
+            text += "".join(f"; {line}" for line in tried if line and line not in stated)
             self.state.t_before, self.state.t_after = self.state.t_after, text
             self.draw()
 
@@ -134,11 +139,10 @@ class Preview:
         for grid, picture, view in zip(self.grids, self.pictures, self.views, strict=True):
             if grid is None:
                 continue
-            low, high = grid.bounds[4:]
-            at = low + float(self.state.t_plane) * (high - low)
             shown = look.Look(
-                colour=self.state.t_colour, limits=limits, slices=(None, None, at), theme=self.state.theme,
-                arrows=max(1, round(max(grid.dimensions) / 14)), hide_replaced=False, replaced=True,
+                colour=self.state.t_colour, limits=limits, slices=(None, None, float(self.state.t_z)),
+                theme=self.state.theme, hide_replaced=False, replaced=True,
+                arrows=max(1, round(max(grid.dimensions) / 14)),
             )  # fmt: skip
             picture.show(grid, shown, {}, title_of(self.state.t_colour))
             view.update()
@@ -198,7 +202,7 @@ class Preview:
                         more = {"v_if": f"!{name}_auto"}
                     controls.slider(name, label, *numbers, **more)
                 html.H3("Shown")
-                controls.slider("t_plane", "depth of the plane, share", 0, 1, 0.01, 0.5)
+                controls.slider("t_z", "z of the plane", ("t_depth[0]",), ("t_depth[1]",), 0.01, 0.0, unit="mm")
                 controls.choice("t_colour", "colour", (["speed", "u", "v", "w", "uncertainty", "peak_ratio"],), "speed")
             with html.Div(classes="lf-main lf-double", v_show="t_after"), html.Div(classes="lf-views"):
                 names = {"before: {{ t_before }}": "t_before", "{{ t_before && 'after: ' }}{{ t_after }}": "t_after"}

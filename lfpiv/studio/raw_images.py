@@ -30,8 +30,6 @@ HOT_SIGMA, HOT_RATIO = 12.0, 5.0
 """Least height of a hot pixel: in standard deviations of the noise, and over the height of its highest neighbour."""
 KEPT_IMAGES = 3
 """Images, and what is seen in them, that are kept."""
-MOST_LISTED = 1000
-"""Largest number of frames of particles that are listed."""
 ARROW_GAIN = 50.0
 """Factor by which residuals of dots are drawn longer than they are."""
 REFOCUSED = 100
@@ -41,10 +39,7 @@ PUPIL_POINTS = 19
 
 
 class RawImages:
-    """The images of an open experiment, with the last ones that were read, and their cameras.
-
-    Without the folder of a run, whose calibration is taken, cameras are nominal thin lenses.
-    """
+    """The images of an experiment, of which the last are kept, and its cameras, calibrated by a run or nominal."""
 
     def __init__(self, experiment: Experiment, results: Path | None = None) -> None:
         self.experiment, self.results = experiment, results
@@ -65,7 +60,7 @@ class RawImages:
         found |= {f"plane {plane}": partial(e.board_image, camera, plane) for plane in range(len(e.board.planes_mm))}
         if setup.background is not None:
             found |= {f"background {frame}": partial(e.background_image, camera, frame) for frame in e.laser_names}
-        frames = map(e.recording.frame, e.recording.frames[:MOST_LISTED])
+        frames = map(e.recording.frame, e.recording.frames[:1000])
         return found | {frame.label: partial(e.frame_image, camera, frame) for frame in frames}
 
     def names(self, camera: str) -> list[str]:
@@ -129,14 +124,8 @@ class RawImages:
     def dots(self, camera: str, plane: int) -> tuple[np.ndarray, list[str], np.ndarray]:
         """Return where the dots of a plane lie, what they are called, and their residual arrows.
 
-        Returns
-        -------
-        places : ndarray, shape (dot, 2)
-            (column, row) of each dot's light through the middle of the pupil, as the mapping has it [pixel].
-        names : list of str
-            Column and row of the dot on the board.
-        arrows : ndarray, shape (n, 4)
-            From a measured dot's predicted place, `ARROW_GAIN` times its residual [pixel].
+        (column, row) of each dot's light through the middle of the pupil, as the mapping has it [pixel]; its column and
+        row on the board; of measured dots (n, 4), from there `ARROW_GAIN` times the residual [pixel].
         """
         from lfpiv.calibration.board.dots import DotBoard  # imports Taichi
 
@@ -192,10 +181,7 @@ class RawImages:
         return spread_over_pupil(0.9 * self.calibrated(camera).optics.pupil_radius_mm)[:PUPIL_POINTS]
 
     def refocused(self, camera: str, name: str, z_mm: float) -> np.ndarray:
-        """Return the light that comes from a plane of the volume, x to the right and y up; 0 where none is seen.
-
-        The light of `PUPIL_POINTS` pupil views is summed along the rays of the camera.
-        """
+        """Return the light of a plane, x to the right and y up, the mean of `PUPIL_POINTS` views; 0: not seen."""
         found, grid = self.calibrated(camera), self.experiment.grid
         sides = grid.voxel_mm * np.array(grid.shape[:0:-1])
         counts = np.rint(REFOCUSED * sides / sides.max()).astype(int)

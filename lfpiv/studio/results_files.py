@@ -16,7 +16,6 @@ from trame.widgets import vuetify3 as v3
 
 from lfpiv.results import tables
 from lfpiv.studio import controls, layers, look
-from lfpiv.studio.charts import title_of
 
 FRAMES_PER_S = {"turn": 20, "series": 8}
 """Pictures of a film per second."""
@@ -81,7 +80,8 @@ class Files:
 
     def vti(self) -> Any:
         """Return the fields of the moment as VTK image data."""
-        return self._written("field.vti", self.results.grid(self.results.folders[0], self.results.wanted.moment).save)
+        of = self.results.folders[0], self.results.wanted.moment
+        return self._written("field.vti", self.results.grid(*of, *self.results.titles).save)
 
     def csv(self) -> Any:
         """Return the vectors of the moment as a table, a row each."""
@@ -102,7 +102,7 @@ class Files:
         camera = [tuple(float(value) for value in vector) for vector in plotter.camera_position]
         size = tuple(plotter.window_size)
         seen = self.results.alike(self.results.wanted)
-        self.state.r_script = look.script(seen, folders, title_of(self.state.r_colour), camera, size)
+        self.state.r_script = look.script(seen, folders, self.results.titles[seen.colour], camera, size)
         self.state.r_script_shown = True
 
     def buttons(self) -> None:
@@ -120,6 +120,4 @@ class Files:
                     v_model=("r_script",), readonly=True, rows=18, id="r-script", raw_attrs=['aria-label="script"'],
                     style="width:100%;font-family:monospace;font-size:12px",
                 )  # fmt: skip
-                with html.Div(classes="lf-buttons"):
-                    controls.button("Copy", "window.navigator.clipboard.writeText(r_script)", "mdi-content-copy")
-                    controls.button("Close", "r_script_shown = false")
+                controls.button("Copy", "window.navigator.clipboard.writeText(r_script)", "mdi-content-copy")

@@ -50,13 +50,7 @@ def holder(out: Path) -> Holder | None:
 
 
 def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
-    """Start `lfpiv run` in a session of its own; return its process.
-
-    Raises
-    ------
-    InputError
-        If another run holds the folder, or it cannot be written.
-    """
+    """Start `lfpiv run` in a session of its own; return its process. InputError if another run holds the folder."""
     if (other := holder(out)) is not None:
         raise InputError(
             f"{out}: expected a folder that no other run writes to, found it held by process {other.process} since "
@@ -74,17 +68,17 @@ def start(experiment: Path, out: Path, options: Sequence[str]) -> int:
             command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, PROGRESS_FILE: str(out / PROGRESS)}, cwd=experiment.parent,
         )  # fmt: skip
-    _children[process.pid] = process
+    children[process.pid] = process
     return int(process.pid)
 
 
-_children: dict[int, psutil.Popen] = {}
+children: dict[int, psutil.Popen] = {}
 """Runs that this studio started: they are asked for their status, or they stay as zombies."""
 
 
 def status(process: int) -> str:
     """Return "running", "paused" or "ended"."""
-    own = _children.get(process)
+    own = children.get(process)
     if own is not None and own.poll() is not None:
         return "ended"
     try:
@@ -96,16 +90,8 @@ def status(process: int) -> str:
     return "paused" if state in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP) else "running"
 
 
-def exit_status(process: int) -> int | None:
-    """Return the exit status of a run that this studio started and that ended; None otherwise."""
-    return _children[process].poll() if process in _children else None
-
-
 def control(process: int, what: str) -> None:
-    """Let a run and its workers "pause" where they are or "resume", or "stop" the run as Ctrl-C does.
-
-    What is finished stays when a run is stopped, and the same command goes on from there.
-    """
+    """Let a run and its workers "pause" or "resume", or "stop" it as Ctrl-C does: Start goes on from there."""
     for number in SIGNALS[what]:
         with contextlib.suppress(OSError):
             leads = os.getpgid(process) == process and number != signal.SIGINT
@@ -127,10 +113,7 @@ def logged_warnings(out: Path) -> list[str]:
 
 
 def stages(out: Path) -> list[dict[str, Any]]:
-    """Return the steps of a run in order: name, finished fraction, and the time left as far as it is known.
-
-    A step of pairs has its latest `SHOWN_PAIRS` pairs, each with the same.
-    """
+    """Return the steps of a run in order, as `_shown` has them; a step of pairs with its latest `SHOWN_PAIRS`."""
     steps: dict[str, dict[str, Any]] = {}
     for line in tail(out / PROGRESS).splitlines():
         with contextlib.suppress(ValueError, KeyError, TypeError):

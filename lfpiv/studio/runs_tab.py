@@ -14,8 +14,6 @@ from lfpiv.errors import InputError
 from lfpiv.studio import controls, run_process, warning_cards
 from lfpiv.studio.session import Session
 
-SHOWN_LINES = 60
-"""Lines of the log that are shown."""
 LOOK_EVERY_S = 0.5
 """Interval at which the state of a run is read [s]."""
 
@@ -32,7 +30,7 @@ class Runs:
             "p_warnings": [], "p_end": "", "p_left": "",
         })  # fmt: skip
         session.listeners.append(self._changed)
-        session.server.controller.on_server_ready.add(lambda **_: session.start(self._watch()))
+        session.start(self._watch())
         session.closers.append(self._close)
         self._page()
 
@@ -46,6 +44,8 @@ class Runs:
         results, experiment = self.session.results, self.session.experiment
         if what == "results" and results is not None and results.is_dir():
             self.state.p_out = self.session.places.name(results)
+            self.state.p_warnings = self._cards(run_process.finished_warnings(results))
+            self.state.p_end = "results are there; Start measures what is missing or changed"
         elif what == "experiment" and results is None and experiment is not None:
             self.state.p_out = self.session.places.name(experiment.parent / "results")
 
@@ -89,7 +89,7 @@ class Runs:
         now = "none" if self.process is None else run_process.status(self.process)
         if now in ("running", "paused") or s.p_status in ("running", "paused"):
             s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
-            s.p_log = "\n".join(run_process.tail(out / run_process.LOG).splitlines()[-SHOWN_LINES:])
+            s.p_log = "\n".join(run_process.tail(out / run_process.LOG).splitlines()[-60:])
             s.p_warnings = self._cards({"text": text} for text in run_process.logged_warnings(out))
         if s.p_status in ("running", "paused") and now == "ended":
             self._ended(out)
@@ -97,7 +97,8 @@ class Runs:
 
     def _ended(self, out: Path) -> None:
         """Show warnings of the finished run, and its results in the other tabs."""
-        number = run_process.exit_status(self.process or 0)
+        own = run_process.children.get(self.process or 0)
+        number = own.poll() if own is not None else None
         self.process = None
         ends = {0: "finished", 3: "finished; some pairs failed", None: "ended"}
         early = "stopped; Start goes on from there" if self.stopped else "ended early; see its log"

@@ -34,13 +34,10 @@ def require_extra() -> None:
 
 def quiet_closed_pages() -> None:
     """Suppress log records of connections that a closed page ended while the server was sending to it."""
-
-    def kept(record: logging.LogRecord) -> bool:
-        _, error, _ = record.exc_info or sys.exc_info()
-        return not isinstance(error, ConnectionError)
-
     for name in ("wslink.protocol", "asyncio"):
-        logging.getLogger(name).addFilter(kept)
+        logging.getLogger(name).addFilter(
+            lambda record: not isinstance((record.exc_info or sys.exc_info())[1], ConnectionError)
+        )
 
 
 def serve(
@@ -50,23 +47,10 @@ def serve(
     browser: bool = True,
     ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Serve the studio until it is interrupted or closed.
+    """Serve the studio for an experiment file, results or a folder with either, until it is interrupted.
 
-    Parameters
-    ----------
-    path : path, optional
-        Experiment file, results of a run, or a folder with either; default: the present folder.
-    port : int
-        Port of 127.0.0.1; 0 for a free one.
-    browser : bool
-        Open the page in the browser.
-    ready : callable, optional
-        Called with the address, token included, when the page can be opened.
-
-    Raises
-    ------
-    InputError
-        If packages of the extra are missing, or there is nothing at `path`.
+    Port 0 is a free one. `ready` is called with the address, token included, when the page can be opened. Raise
+    InputError if packages of the extra are missing, or there is nothing at `path`, by default the present folder.
     """
     require_extra()
     given = Path.cwd() if path is None else Path(path)
@@ -83,15 +67,10 @@ def serve(
 async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], None] | None) -> None:
     """Serve until a signal comes. Then call the tabs' closers and end the process at once, threads included."""
     gc.disable()  # garbage collection during imports takes a fifth of the start
-    import pyvista
-
     from lfpiv.studio import access, page
 
-    pyvista.vtk_verbosity("error")  # VTK warns where it finds no screen, and then draws without
-    token, session = secrets.token_urlsafe(24), page.build(given)
-    server = session.server
-    gc.freeze()
-    gc.enable()
+    token, server, listening = secrets.token_urlsafe(24), page.opened(), asyncio.Event()
+    closers: list[Callable[[], None]] = []
 
     def bind(bound: Any) -> None:
         bound.app.middlewares.append(access.guard(token))
@@ -103,9 +82,16 @@ async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], Non
             ready(address)
         if browser:
             webbrowser.open(address)
+        listening.set()
+
+    async def fill() -> None:
+        await listening.wait()
+        await page.fill(server, given, closers)
+        gc.freeze()
+        gc.enable()
 
     def end() -> None:
-        for close in session.closers:
+        for close in closers:
             close()
         sys.stdout.flush()
         os._exit(0)
@@ -114,10 +100,13 @@ async def _run(given: Path, port: int, browser: bool, ready: Callable[[str], Non
     server.controller.on_server_ready.add(started)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, end)
+    serving = server.start(  # thread: no handlers of signals besides those above
+        port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
+        disable_logging=True, timeout=0, thread=True,
+    )  # fmt: skip
     try:
-        await server.start(  # thread: no handlers of signals besides those above
-            port=port, host="127.0.0.1", exec_mode="coroutine", open_browser=False, show_connection_info=False,
-            disable_logging=True, timeout=0, thread=True,
-        )  # fmt: skip
+        await asyncio.gather(serving, fill())
     except OSError as error:
+        if listening.is_set():
+            raise
         raise InputError(f"port {port}: {(error.strerror or str(error)).lower()}. Choose another --port.") from None

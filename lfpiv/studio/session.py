@@ -9,14 +9,16 @@ import os
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lfpiv.errors import InputError
 from lfpiv.results.stores import is_store
 from lfpiv.studio.access import Places, belongs, is_run
-from lfpiv.studio.draft import Draft
+
+if TYPE_CHECKING:
+    from lfpiv.studio.draft import Draft
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +80,7 @@ class Session:
             raise InputError("experiment: the form has changes that are not saved. Save them first, or undo them.")
 
     def changed(self, *whats: str) -> None:
-        """Tell all tabs what is open, and whether the "experiment" or the "results" changed."""
+        """Say what is open, and tell all tabs what changed."""
         for name, path in (("experiment", self.experiment), ("results", self.results)):
             self.state[f"{name}_open"] = str(path or "")
             self.state[f"{name}_name"] = self.places.name(path) if path else ""

@@ -22,8 +22,6 @@ from lfpiv.studio.session import NO_EXPERIMENT, Session
 
 COLOURS = ("#2f81d7", "#d9822b", "#2a9d5c", "#a259c9", "#c0392b", "#0f8b8d")
 SOLID, BOARD, HANDLE = "#8a6d3b", "#d4a017", "#d92d20"
-SIGNIFICANT = 4
-"""Digits of the numbers that dragging writes."""
 
 
 class Space:
@@ -116,32 +114,24 @@ class Space:
         solid = solids[int(name.rpartition(".")[2])] if name.startswith("volume.solid.") else None
         if isinstance(solid, HalfSpace):
             self.plotter.add_plane_widget(
-                self._plane_dragged, normal=solid.normal, origin=solid.point_mm, bounds=box, factor=1.0,
+                lambda normal, origin: self._dragged(normal=normal, point_mm=origin), normal=solid.normal,
+                origin=solid.point_mm, bounds=box, factor=1.0,
                 normal_rotation=True, color=SOLID, outline_translation=False, interaction_event="end",
             )  # fmt: skip
         elif solid is not None or name == "volume":
             bounds = box if solid is None else rig_space.bounds_of(solid.centre_mm, solid.size_mm)
             widget = self.plotter.add_box_widget(
-                self._box_dragged, bounds=bounds, rotation_enabled=False, factor=1.0,
+                lambda box: self._dragged(centre_mm=box.center, size_mm=np.ptp(box.points, axis=0)), bounds=bounds,
+                rotation_enabled=False, factor=1.0,
                 color=INK[self.state.theme] if solid is None else SOLID,
             )  # fmt: skip
             widget.GetHandleProperty().SetColor(pv.Color(HANDLE).float_rgb)  # white by itself, as the ground
 
-    def _box_dragged(self, box: pv.PolyData) -> None:
-        bounds = np.asarray(box.bounds)
-        self._dragged(centre_mm=(bounds[::2] + bounds[1::2]) / 2, size_mm=bounds[1::2] - bounds[::2])
-
-    def _plane_dragged(self, normal: Any, origin: Any) -> None:
-        self._dragged(normal=normal, point_mm=origin)
-
     def _dragged(self, **moved: Any) -> None:
-        """Write numbers into the draft unless they are there already, and show them in the form.
-
-        There is no new drawing while the handle is held.
-        """
+        """Write new numbers into the draft and the form, without a new drawing while the handle is held."""
         draft, location = self.session.edited, location_of(self.state.s_drag)
         for key, numbers in moved.items() if location else ():
-            values = [float(f"{value:.{SIGNIFICANT}g}") + 0.0 for value in numbers]
+            values = [float(f"{value:.4g}") + 0.0 for value in numbers]
             old = draft.get([*location, key])
             if old is None or not np.allclose(old, values, rtol=1e-3, atol=1e-6):
                 draft.set([*location, key], values)

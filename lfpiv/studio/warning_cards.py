@@ -22,30 +22,21 @@ FIGURE = re.compile(r"\{[^}]*\}")
 """Place of a figure in a sentence."""
 PARTS = re.compile(r"((?:\([^)]*\)|.)*?(?:[;.] |: (?=check|look)|$))(.*)", re.DOTALL)
 """What a sentence says, up to the first stop outside brackets, and what to do."""
-REGION = ("left", "top", "right", "bottom")
 
 
 def card(record: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     """Return the card of a stored warning, or of one of a log, which has its ``text`` alone.
 
-    Parameters
-    ----------
-    record : mapping
-        ``text``, the sentence; of a stored warning also ``code``, ``subject``, ``figures``, ``pairs`` and ``instants``.
-    cameras : sequence of str
-        Names of all cameras.
-
-    Returns
-    -------
-    dict
-        ``what``, ``remedy``, ``code``, ``link``, and ``place``: camera, image and region [pixel] if known.
+    A stored warning also has ``code``, ``subject``, ``figures``, ``pairs`` and ``instants``. The card has ``what``,
+    ``remedy``, ``code``, ``link``, and ``place``: camera, image and region [pixel] if known.
     """
     text = str(record["text"])
     code = str(record.get("code") or _code_of(text))
     what, remedy = PARTS.findall(text)[0]
     figures, named = record.get("figures") or {}, str(record.get("subject") or text)
     camera = next((name for name in cameras if re.match(rf"{re.escape(name)}([,:]|$)", named)), "")
-    region = [int(figures[name]) for name in REGION] if all(name in figures for name in REGION) else []
+    ends = [figures[name] for name in ("left", "top", "right", "bottom") if name in figures]
+    region = [int(end) for end in ends] if len(ends) == 4 else []
     place = {"camera": camera, "image": _image(code, text, record), "region": region} if camera else None
     link = f"pages/troubleshooting#{code}"
     return {"what": what.rstrip(" ;:"), "remedy": remedy, "code": code, "place": place, "link": link}
@@ -87,6 +78,8 @@ def page(name: str) -> str | None:
         for code, sentence in SENTENCES.items()
         if code is not Code.OTHER
     )
-    head = '<meta charset="utf-8"><link rel="stylesheet" href="../lfpiv_studio/studio.css">'
+    head = (
+        f'<meta charset="utf-8"><link rel="stylesheet" href="../lfpiv_studio/studio.css"><title>lfpiv: {name}</title>'
+    )
     body = body.replace("<p>@</p>", f"<dl>{listed}</dl>")
-    return f'<!doctype html><html lang="en">{head}<title>lfpiv: {name}</title><body class="lf-doc">{body}'
+    return f'<!doctype html><html lang="en">{head}<body class="lf-doc">{body}'

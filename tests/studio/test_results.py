@@ -1,5 +1,7 @@
 """Results on the page: a first picture, planes, surfaces, and the script that draws what is seen."""
 
+import asyncio
+import json
 import shutil
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from support.report_run import field
 from support.studio_page import served, until
 
 from lfpiv.results import netcdf
+from lfpiv.warn import Code, Warning
 
 SAME_PICTURE = 1.0
 """Largest mean difference of pictures by the same calls [grey level]: fonts may be a pixel apart."""
@@ -91,6 +94,66 @@ def test_fewer_arrows_and_shorter_lines_are_drawn_while_something_moves(results)
         points.append(drawn[-1].mapper.dataset.n_points)
     assert drawn[0] is drawn[1] and drawn[2] is drawn[3]  # what is at rest stays where nothing else is asked for
     assert 0 < points[0] < points[2]
+
+
+def test_results_are_built_before_other_tabs_and_stresses_can_be_chosen(results, tmp_path, monkeypatch):
+    from lfpiv.studio import delivery, page
+
+    monkeypatch.setattr("lfpiv.studio.runs_tab.LOOK_EVERY_S", 60)
+    monkeypatch.setattr(delivery, "SENT", asyncio.Event())
+    shutil.copytree(results / "vectors", tmp_path / "vectors")
+    summary = {"warning_records": [Warning(code=Code.ONE_CAMERA).to_json()]}
+    (tmp_path / "summary.json").write_text(json.dumps(summary), "utf-8")
+
+    async def until_so(condition):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+    async def see():
+        server = page.opened()
+        server.state.ready()  # as a server that listens
+        state, filling = server.state, asyncio.ensure_future(page.fill(server, tmp_path, []))
+
+        def built():
+            return [name for name in page.TABS if state[f"trame__template_{name}"]]
+
+        await until_so(lambda: state.tab)
+        await asyncio.sleep(0.2)
+        assert built() == ["results"] and state.tab == "results"
+        delivery.SENT.set()  # the page has the first picture
+        await filling
+        assert built() == list(page.TABS)
+        assert [card["code"] for card in state.p_warnings] == ["one_camera"]  # of results that are opened
+
+        await until_so(lambda: state.r_facts)
+        assert "vectors are valid" in state.r_facts[0] and state.r_facts[-1].startswith("speed [m/s] at (")
+        with state:
+            state.r_moment = "fluctuations"
+        await until_so(lambda: state.r_colour == "turbulent_kinetic_energy" and not state.r_busy)
+        listed = {field["value"]: field["title"] for field in state.r_fields}
+        assert listed["uv"] == "uv [m²/s²]" and listed["u_rms"] == "u rms [m/s]"
+        with state:
+            state.r_colour = "uv"
+        await until_so(lambda: any(fact.startswith("uv [m²/s²] at (") for fact in state.r_facts))
+        with state:
+            state.r_moment = "0"
+        await until_so(lambda: state.r_colour == "speed")
+
+    asyncio.run(asyncio.wait_for(see(), 60))
+
+
+def test_fields_are_read_and_derived_when_they_are_asked_for(results):
+    import lfpiv
+    from lfpiv.studio import layers
+
+    vectors = layers.field_at(lfpiv.open_results(results), "0")
+    grid, whole = layers.grid_of(vectors, ()), layers.grid_of(vectors)
+    assert {"u", "v", "w", "valid", "velocity", "speed"} <= {
+        *grid.array_names
+    } and "q_criterion" not in grid.array_names
+    layers.add_fields(grid, vectors, ["q_criterion", "peak_ratio", "no such field"])
+    assert {*grid.array_names} <= {*whole.array_names} and "divergence" not in grid.array_names
+    assert all(np.array_equal(grid[name], whole[name], equal_nan=True) for name in grid.array_names)
 
 
 @pytest.fixture

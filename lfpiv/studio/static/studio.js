@@ -21,11 +21,8 @@
       function paint() {
         if (!data) return;
         const { values, rows, columns, channels } = data, count = rows * columns;
-        const pixels = new Uint8ClampedArray(4 * count), low = props.low, scale = 255 / Math.max(props.high - low, 1e-9);
-        for (let i = 0; i < count; i++) {
-          for (let c = 0; c < 3; c++) pixels[4 * i + c] = (values[channels === 1 ? i : 3 * i + c] - low) * scale;
-          pixels[4 * i + 3] = 255;
-        }
+        const pixels = new Uint8ClampedArray(4 * count).fill(255), low = props.low, scale = 255 / Math.max(props.high - low, 1e-9);
+        for (let i = 0; i < count; i++) for (let c = 0; c < 3; c++) pixels[4 * i + c] = (values[channels === 1 ? i : 3 * i + c] - low) * scale;
         bitmap = Object.assign(document.createElement('canvas'), { width: columns, height: rows });
         bitmap.getContext('2d').putImageData(new ImageData(pixels, columns, rows), 0, 0);
         draw();
@@ -37,7 +34,7 @@
       }
 
       function look(region) {
-        if (!data || !region || !region.length) return;
+        if (!data || !region?.length) return;
         aim(region[0] - 10, region[1] - 10, region[2] + 10, region[3] + 10, 0.5);
         draw();
       }
@@ -45,8 +42,7 @@
       function draw() {
         const sheet = canvas.value, frame = box.value;
         if (!sheet || !frame) return;
-        const ratio = window.devicePixelRatio || 1;
-        const width = Math.round(frame.clientWidth * ratio), height = Math.round(frame.clientHeight * ratio);
+        const ratio = window.devicePixelRatio || 1, [width, height] = [frame.clientWidth, frame.clientHeight].map((px) => Math.round(px * ratio));
         if (!width || !height) return;
         if (sheet.width !== width || sheet.height !== height) { sheet.width = width; sheet.height = height; view = null; }
         const context = sheet.getContext('2d');
@@ -56,7 +52,7 @@
         context.imageSmoothingEnabled = !!props.smooth || view.scale < 1;
         context.drawImage(bitmap, view.x, view.y, data.columns * view.scale, data.rows * view.scale);
         for (const mark of props.marks || []) drawMark(context, mark);
-        if (props.region && props.region.length) {
+        if (props.region?.length) {
           const [x, y] = at(props.region[0] - 0.5, props.region[1] - 0.5), [u, v] = at(props.region[2] + 0.5, props.region[3] + 0.5);
           Object.assign(context, { lineWidth: 2, strokeStyle: '#ff922b' });
           context.strokeRect(x, y, u - x, v - y);
@@ -67,21 +63,17 @@
       const at = (column, row) => [view.x + (column + 0.5) * view.scale, view.y + (row + 0.5) * view.scale];
 
       function drawMark(context, mark) {
-        context.strokeStyle = context.fillStyle = mark.colour;
-        context.lineWidth = 1.5;
+        Object.assign(context, { strokeStyle: mark.colour, fillStyle: mark.colour, lineWidth: 1.5 });
         const size = mark.radius ? mark.radius * view.scale : 4, places = mark.places;
-        if (mark.kind === 'arrows') {
-          for (const [a, b, c, d] of places) arrow(context, ...at(a, b), ...at(c, d));
-          return;
-        }
-        places.forEach(([column, row], number) => {
+        if (mark.kind === 'arrows') places.forEach(([a, b, c, d]) => arrow(context, ...at(a, b), ...at(c, d)));
+        else places.forEach(([column, row], number) => {
           const [x, y] = at(column, row);
           if (x < -20 || y < -20 || x > canvas.value.width + 20 || y > canvas.value.height + 20) return;
           context.beginPath();
           context.arc(x, y, Math.max(size, 1), 0, 7);
           if (mark.kind === 'points') context.fill(); else context.stroke();
           if (mark.names) {
-            context.font = '12px sans-serif';
+            context.font = mark.kind === 'points' ? 'bold 15px sans-serif' : '12px sans-serif';
             Object.assign(context, { lineWidth: 3, strokeStyle: 'rgba(14, 16, 19, 0.85)' });  // read on any picture
             context.strokeText(mark.names[number], x + size + 2, y - size);
             context.fillText(mark.names[number], x + size + 2, y - size);
@@ -113,9 +105,8 @@
 
       let waiting = null;
       function point(spot) {
-        const column = Math.round(spot.column), row = Math.round(spot.row);
+        const column = Math.round(spot.column), row = Math.round(spot.row), i = row * data.columns + column;
         if (column < 0 || row < 0 || column >= data.columns || row >= data.rows) { readout.value = ''; return; }
-        const i = row * data.columns + column;
         const value = data.channels === 1 ? data.values[i].toPrecision(5) * 1 : '';
         readout.value = `column ${column}, row ${row}: ${value}`;
         if (!waiting) setTimeout(() => { const [c, r] = waiting; waiting = null; emit('point', [c, r]); }, 40);
@@ -125,11 +116,9 @@
       function move(event) {
         if (!view || !data) return;
         const spot = place(event);
-        if (drag) {
-          view.x += spot.x - drag.x; view.y += spot.y - drag.y;
-          drag = spot;
-          draw();
-        } else point(spot);
+        if (!drag) { point(spot); return; }
+        view.x += spot.x - drag.x; view.y += spot.y - drag.y; drag = spot;
+        draw();
       }
 
       function key(event) {
