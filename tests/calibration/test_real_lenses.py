@@ -128,7 +128,14 @@ def test_a_displaced_ring_is_found_with_its_worst_zone_and_none_in_noise():
 def test_single_zones_that_the_pupils_edge_cuts_off_are_not_blamed_on_the_lens():
     """Microimages of nine pixels behind a thin lens show zones at the edge up to .05 pitch aside, their rings not."""
     random, displaced = np.random.default_rng(3), np.zeros((ZONES, 2))
-    displaced[-8:-5] = 0.03 * PITCH, 0.04 * PITCH
+    displaced[-1] = 0.03 * PITCH, 0.04 * PITCH
+    chief = random.uniform(-1, 1, (80, 2))
+    assert not pupil_zones.left_over(fits_of(displaced, 80, random), chief, PITCH).any()
+
+
+def test_a_knocked_board_is_not_blamed_on_the_lens():
+    """A plane tilted by half a degree displaces the dots of a quadrant together, in all zones."""
+    random, displaced = np.random.default_rng(3), np.array([0.02, -0.01]) * PITCH + 0.01 * PITCH * zone_middles()
     chief = random.uniform(-1, 1, (80, 2))
     assert not pupil_zones.left_over(fits_of(displaced, 80, random), chief, PITCH).any()
 

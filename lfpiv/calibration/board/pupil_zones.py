@@ -24,7 +24,7 @@ INNER = 0.9
 
 _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
-_CLEAR = 1.5  # root mean square over the zones of their rings' displacements in standard errors that is told
+_CLEAR = 1.0  # root mean square over the zones of their rings' displacements in standard errors that is told
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
 _ROUNDING = 1e-6  # least variance of an error, as a share of the largest
 _LEAST_SHARE = 1e-10  # least variance of displacements that is tried, as a share of the prior's: a millionth of a pitch
@@ -47,7 +47,8 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
     ndarray, shape (PARTS, ZONES, 2)
         Mean displacement of the rays [mm]. All are zero unless the rings of a part, or of the whole field, are together
         displaced by more than their errors, and a zone by more than what hardly matters. A ring's displacement is the
-        median of its zones: a lens bends rays all around, while the pupil's edge cuts the pixels of single zones.
+        median of its zones: a lens bends rays all around, while the pupil's edge cuts the pixels of single zones. What
+        grows linearly over the pupil does not count: it is the place of dots, as on a board that was knocked.
     """
     found = np.zeros((PARTS, ZONES, 2))
     if len(fits) < _FEWEST:
@@ -62,11 +63,19 @@ def left_over(fits: Sequence[DotFit], chief_mm: np.ndarray, pitch_mm: float) -> 
         mean, scatter, noise = _displacement(pull[here], information[here], pitch_mm)
         error = np.sqrt(np.maximum(np.diag(scatter), np.diag(noise)))
         size, limit = (np.linalg.norm(one.reshape(2, ZONES), axis=0) for one in (mean, error))
-        sure = float(np.sqrt(np.mean(_of_rings(size / limit) ** 2))) > _CLEAR
+        bent = np.linalg.norm(_without_line(mean.reshape(2, ZONES).T / limit[:, None], limit), axis=1)
+        sure = float(np.sqrt(np.mean(_of_rings(bent) ** 2))) > _CLEAR
         clear |= sure and bool(size.max() > _LEAST_PITCHES * pitch_mm)
         if part < PARTS:
             found[part] = mean.reshape(2, ZONES).T
     return found if clear else np.zeros_like(found)
+
+
+def _without_line(displacement: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return displacements [error], shape (ZONES, 2), less what is linear over the pupil."""
+    terms = np.column_stack([np.ones(ZONES), zone_middles()]) / error[:, None]
+    found: np.ndarray = displacement - terms @ np.linalg.lstsq(terms, displacement, rcond=None)[0]
+    return found
 
 
 def _of_rings(values: np.ndarray) -> np.ndarray:
