@@ -4,7 +4,8 @@
     python perf/scaling.py --case 100 2 --angles=30,-30
 
 Every case is a process of its own: weights, both volumes and vectors of blobs of 0.7 voxel with the default settings,
-on voxels as fine as these particles demand. Images are projections of known particles with noise.
+on voxels as fine as these particles demand; then, of two and more cameras, volumes and vectors by the joint fit. Images
+are projections of known particles with noise.
 """
 
 from __future__ import annotations
@@ -62,13 +63,18 @@ def _pair(edge: int, cameras: int, angles_deg: Sequence[float]) -> dict[str, Any
         lambda: _weights(calibration, user.padded(((1, 1),) * 3).refined(factor), factor * BLOB_VOXEL)
     )
     weights.volume = user
-    settings, frames, volumes_s = Smart().of_one_frame(factor), [], 0.0
-    for number in (0, 1):
-        images = _images(weights, factor, number * SHIFT)
-        volume, seconds = _timed(lambda images=images: lfpiv.reconstruct(weights, images, **settings))
-        frames.append(lfpiv.volume_on(volume, user))
-        volumes_s += seconds
-    _, vectors_s = _timed(lambda: lfpiv.correlate(*frames, dt_s=1e-4, **Correlation().model_dump()))
+    settings, windows = Smart().of_one_frame(factor), Correlation().model_dump()
+    images = [_images(weights, factor, number * SHIFT) for number in (0, 1)]
+    frames, volumes_s = _timed(
+        lambda: [lfpiv.volume_on(lfpiv.reconstruct(weights, one, **settings), user) for one in images]
+    )
+    _, vectors_s = _timed(lambda: lfpiv.correlate(*frames, dt_s=1e-4, **windows))
+
+    def fitted() -> None:
+        volumes = lfpiv.reconstruct_pair(weights, images, estimate="joint", correlation=windows, grid=user, **settings)
+        lfpiv.joint_vectors(volumes, dt_s=1e-4, **windows)
+
+    joint_s = _timed(fitted)[1] if cameras > 1 else None
     return {
         "voxels": edge,
         "cameras": cameras,
@@ -77,6 +83,7 @@ def _pair(edge: int, cameras: int, angles_deg: Sequence[float]) -> dict[str, Any
         "weights_gib": weights.memory_bytes / 2**30,
         "volumes_s": volumes_s,
         "vectors_s": vectors_s,
+        "joint_s": joint_s,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }
 

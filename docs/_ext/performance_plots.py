@@ -19,7 +19,12 @@ from lfpiv.report import svg
 FOLDER = Path(__file__).resolve().parents[1] / "figures"
 SCALING, PEERS = FOLDER / "scaling.json", FOLDER / "peers.jsonl"
 GPU_STATIC = FOLDER / "gpu_static.json"
-PARTS = {"weights_s": "weights, once", "volumes_s": "both volumes", "vectors_s": "vectors"}
+PARTS = {
+    "weights_s": "weights, once",
+    "volumes_s": "both volumes",
+    "vectors_s": "vectors",
+    "joint_s": "joint fit",
+}
 PEER_NAMES = {
     "project_small": "projection, SciPy CSR",
     "back_project_small": "back projection, SciPy CSR",
@@ -89,11 +94,11 @@ def draw(name: str) -> str:
 def table() -> str:
     """Return time and memory by size and cameras as Markdown."""
     lines = [
-        "| volume | cameras | weights, once | both volumes | vectors | weights in memory | peak memory |",
-        "|---|---|---|---|---|---|---|",
+        f"| volume | cameras | {' | '.join(PARTS.values())} | weights in memory | peak memory |",
+        f"|{'---|' * (len(PARTS) + 4)}",
     ]
     for row in scaling_rows():
-        times = " | ".join(f"{row[key]:.2g} s" for key in PARTS)
+        times = " | ".join("" if row[key] is None else f"{row[key]:.2g} s" for key in PARTS)
         lines.append(
             f"| {row['voxels']}³ voxels | {row['cameras']} | {times} | {row['weights_gib']:.2g} GiB | "
             f"{row['peak_gib']:.2g} GiB |"
