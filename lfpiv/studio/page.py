@@ -100,7 +100,7 @@ def _bar() -> None:
         html.Div("lfpiv studio", classes="lf-brand")
         with v3.VTabs(v_model=("tab",), density="compact", show_arrows=True, classes="lf-tabs", v_if="tab"):
             for name, (title, *_) in TABS.items():
-                v3.VTab(title, value=name)
+                v3.VTab(title, value=name, disabled=(f"!trame__template_{name}",))  # until it is built
         v3.VBtn(
             icon=("theme === 'light' ? 'mdi-weather-night' : 'mdi-weather-sunny'",),
             click="theme = theme === 'light' ? 'dark' : 'light'", size="small", title="light or dark", id="theme",
