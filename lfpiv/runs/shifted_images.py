@@ -54,7 +54,7 @@ def shifted_images(shown: Shown, pairs: Sequence[int], weights: Weights, *, seri
 
     tried = [(name, sign * lenses) for name in axes for lenses in SHIFTS for sign in (-1, 1)]
     frame, best = max(product(range(FRAMES), tried), key=lambda one: clear(one[1], {one[0]: 1}))
-    if clear(best, {frame: 1}) < SURE:
+    if clear(best, {frame: 1}) < CLEAR:
         return None
     camera, lenses = weights.cameras[best[0]], abs(best[1])
     alike = [name for name, shift in tried if clear(best, {frame: 1}, (name, shift)) < SURE]
