@@ -46,7 +46,6 @@ def patch_light(patch):
     return light
 
 
-@pytest.mark.slow(but="real")
 @pytest.mark.parametrize("name", RIGS)
 def test_patch_equals_its_twin(device, name):
     scene_camera, samples = rig(name, **SMALL), 16

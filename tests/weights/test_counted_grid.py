@@ -113,7 +113,6 @@ def test_rays_of_the_models_are_those_of_the_mapping(name):
         assert np.abs(st - exact).max() <= EXACT * camera.lattice.pitch_mm
 
 
-@pytest.mark.slow(but="in focus-square")
 @pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("place", ["in focus", "far"])
 def test_noise_is_below_that_of_random_rays(name, place):
@@ -149,7 +148,6 @@ def test_neighbours_have_errors_of_their_own():
     assert abs(first @ second) <= 0.2 * np.linalg.norm(first) * np.linalg.norm(second)
 
 
-@pytest.mark.slow
 def test_counts_do_not_depend_on_threads_lanes_batches_or_room(monkeypatch):
     for camera in RIGS.values():
         expected = count(camera, rays=1024)
