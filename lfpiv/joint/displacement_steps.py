@@ -208,7 +208,7 @@ class DisplacementSteps:
         near = np.maximum(near / near.mean(), LEAST_SHARE)
         preconditioner = 1 / (scale * near + rough.mean(1)[:, None, None, None] * SECOND_DIFFERENCES + floor)
         change = conjugate_gradients(
-            lambda change: curvature(change) + model.field.penalty(change, rough) + floor * change,
+            lambda part: curvature(part) + model.field.penalty(part, rough) + floor * part,
             -(gradient + model.field.penalty(nodes, rough)),
             steps=steps,
             tolerance=SMALL_REST,

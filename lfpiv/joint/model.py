@@ -55,7 +55,7 @@ class JointModel:
         self.field = SplineField(weights.grid, SPACING_VOXEL * weights.volume.voxel_mm / weights.grid.voxel_mm)
         self.sieve_voxel = frames[0].normalisation.sieve.sigma_voxel
         light = [
-            sum(float(image.image.sum(dtype=np.float64)) / image.camera_gain for image in frame.images.values())
+            sum(float(seen.image.sum(dtype=np.float64)) / seen.camera_gain for seen in frame.images.values())
             for frame in frames
         ]
         self.power = [np.float32(of_frame / math.sqrt(light[0] * light[1])) for of_frame in light]

@@ -105,7 +105,7 @@ class _Cells:
         """
         seen = [image.ravel()[self._pixels] for image in images]
         lit = [light for one in seen if (light := np.maximum(one - np.median(one), 0)).any()]
-        apart = np.zeros(self.weights.grid.shape, np.float32)
+        apart = np.zeros(self.weights.grid.shape, np.float32)  # four voxels whose images do not overlap
         for corner, (y, x) in enumerate(np.ndindex(2, 2)):
             quarters = (1 + 2 * (corner in (1, 2)), 1 + 2 * y, 1 + 2 * x)
             apart[tuple(size * far // 4 for size, far in zip(apart.shape, quarters, strict=True))] = 1

@@ -16,6 +16,7 @@ from lfpiv.errors import InputError, printable
 from lfpiv.records import RecordError, open_regular, read_object, read_text
 from lfpiv.results.folder import Folder
 
+HOSTS = ("127.0.0.1", "localhost")  # names by which a browser of this machine asks
 DEEPEST = 3
 """Levels of folders below a given one that are searched for experiments and results."""
 MOST_FOLDERS = 5000
@@ -33,7 +34,7 @@ def guard(token: str) -> Callable[[web.Request, Handler], Awaitable[web.StreamRe
     async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
         host = urlsplit(f"//{request.headers.get('Host', '')}")
         origin = request.headers.get("Origin")
-        if host.hostname not in ("127.0.0.1", "localhost") or (origin and urlsplit(origin).netloc != host.netloc):
+        if host.hostname not in HOSTS or (origin and urlsplit(origin).netloc != host.netloc):
             raise web.HTTPForbidden(text="lfpiv studio answers its own page only.")
         name, asked = f"lfpiv_{host.port}", request.query.get("token", "")
         known = (asked, request.cookies.get(name, ""))

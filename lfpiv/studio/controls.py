@@ -9,6 +9,7 @@ import trame_client.widgets.html as html
 from trame.widgets import vtk
 from trame.widgets import vuetify3 as v3
 
+DIGITS = 5  # of a slider's value in the field beside it
 KEYS = {
     "ArrowLeft": (-15.0, 0.0, 1.0), "ArrowRight": (15.0, 0.0, 1.0), "ArrowUp": (0.0, 15.0, 1.0),
     "ArrowDown": (0.0, -15.0, 1.0), "+": (0.0, 0.0, 1.2), "-": (0.0, 0.0, 1 / 1.2),
@@ -24,7 +25,7 @@ def slider(name: str, label: str, low: Any, high: Any, step: Any, first: Any, *,
         told = f"{name} = Number($event.target.value)"
         html.Input(type="range", min=low, max=high, step=step, value=(name,), id=f"s-{name}", input=told)
         html.Input(
-            type="number", value=(f"+Number({name}).toPrecision(5)",), step="any", id=f"n-{name}",
+            type="number", value=(f"+Number({name}).toPrecision({DIGITS})",), step="any", id=f"n-{name}",
             raw_attrs=[f'aria-label="{label}, typed"'], change=told,
         )  # fmt: skip
 

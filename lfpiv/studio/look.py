@@ -20,6 +20,7 @@ REPLACED = "#8a8f98"
 """Colour of vectors that are replaced."""
 TICKS = (0.15, 0.35, 0.8)
 """Least sides, as shares of the longest, that have two ticks, three, and ticks at round numbers."""
+LINE_PX = 3  # width of streamlines
 CLOUDS: dict[str, Any] = {"particles": {"point_size": 4.0}, "tracks": {"line_width": 2.0}}
 """What is drawn as it is -> its style."""
 SIGNED = {"u", "v", "w", "divergence", "q_criterion", "vorticity_x", "vorticity_y", "vorticity_z", "uv", "uw", "vw"}
@@ -150,7 +151,7 @@ class Picture:
         self._layer(
             "lines", look.lines and (key, look.lines, shade),
             lambda: layers.stream_lines(grid, look.lines, look.colour, moving), moving, **paint,
-            line_width=3, render_lines_as_tubes=True,
+            line_width=LINE_PX, render_lines_as_tubes=True,
         )  # fmt: skip
         for name, style in CLOUDS.items():
             cloud = clouds.get(name) if getattr(look, name) else None
@@ -215,7 +216,10 @@ class Picture:
 
 
 def script(look: Look, results: Sequence[str], title: str, camera: Any, size: tuple[int, int]) -> str:
-    """Return a program that draws folders of results, or stores, as they are seen, each as a PNG."""
+    """Return a program that draws folders of results, or stores, as they are seen: ``picture.png``, ``picture1.png``.
+
+    `title` is the colour scale's, `camera` position, focal point and direction upwards, `size` columns and rows.
+    """
     stated = {item.name: getattr(look, item.name) for item in fields(look)}
     values = "".join(f"    {name}={value!r},\n" for name, value in stated.items() if value != getattr(Look, name))
     clouds = [f'"{name}": cloud_of("{name}", results, LOOK.moment)' for name in CLOUDS if getattr(look, name)]

@@ -30,6 +30,7 @@ HOT_SIGMA, HOT_RATIO = 12.0, 5.0
 """Least height of a hot pixel: in standard deviations of the noise, and over the height of its highest neighbour."""
 KEPT_IMAGES = 3
 """Images, and what is seen in them, that are kept."""
+MOST_LISTED = 1000  # frames of particles
 ARROW_GAIN = 50.0
 """Factor by which residuals of dots are drawn longer than they are."""
 REFOCUSED = 100
@@ -60,7 +61,7 @@ class RawImages:
         found |= {f"plane {plane}": partial(e.board_image, camera, plane) for plane in range(len(e.board.planes_mm))}
         if setup.background is not None:
             found |= {f"background {frame}": partial(e.background_image, camera, frame) for frame in e.laser_names}
-        frames = map(e.recording.frame, e.recording.frames[:1000])
+        frames = map(e.recording.frame, e.recording.frames[:MOST_LISTED])
         return found | {frame.label: partial(e.frame_image, camera, frame) for frame in frames}
 
     def names(self, camera: str) -> list[str]:

@@ -80,8 +80,8 @@ class Files:
 
     def vti(self) -> Any:
         """Return the fields of the moment as VTK image data."""
-        of = self.results.folders[0], self.results.wanted.moment
-        return self._written("field.vti", self.results.grid(*of, *self.results.titles).save)
+        grid = self.results.grid(self.results.folders[0], self.results.wanted.moment, *self.results.titles)
+        return self._written("field.vti", grid.save)
 
     def csv(self) -> Any:
         """Return the vectors of the moment as a table, a row each."""

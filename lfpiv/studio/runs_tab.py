@@ -14,6 +14,7 @@ from lfpiv.errors import InputError
 from lfpiv.studio import controls, run_process, warning_cards
 from lfpiv.studio.session import Session
 
+SHOWN_LINES = 60  # of the log
 LOOK_EVERY_S = 0.5
 """Interval at which the state of a run is read [s]."""
 
@@ -89,7 +90,7 @@ class Runs:
         now = "none" if self.process is None else run_process.status(self.process)
         if now in ("running", "paused") or s.p_status in ("running", "paused"):
             s.p_stages, s.p_left = run_process.stages(out), run_process.time_left(out)
-            s.p_log = "\n".join(run_process.tail(out / run_process.LOG).splitlines()[-60:])
+            s.p_log = "\n".join(run_process.tail(out / run_process.LOG).splitlines()[-SHOWN_LINES:])
             s.p_warnings = self._cards({"text": text} for text in run_process.logged_warnings(out))
         if s.p_status in ("running", "paused") and now == "ended":
             self._ended(out)

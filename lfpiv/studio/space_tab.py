@@ -22,6 +22,7 @@ from lfpiv.studio.session import NO_EXPERIMENT, Session
 
 COLOURS = ("#2f81d7", "#d9822b", "#2a9d5c", "#a259c9", "#c0392b", "#0f8b8d")
 SOLID, BOARD, HANDLE = "#8a6d3b", "#d4a017", "#d92d20"
+DIGITS = 4  # of the numbers that dragging writes
 
 
 class Space:
@@ -131,7 +132,7 @@ class Space:
         """Write new numbers into the draft and the form, without a new drawing while the handle is held."""
         draft, location = self.session.edited, location_of(self.state.s_drag)
         for key, numbers in moved.items() if location else ():
-            values = [float(f"{value:.4g}") + 0.0 for value in numbers]
+            values = [float(f"{value:.{DIGITS}g}") + 0.0 for value in numbers]
             old = draft.get([*location, key])
             if old is None or not np.allclose(old, values, rtol=1e-3, atol=1e-6):
                 draft.set([*location, key], values)

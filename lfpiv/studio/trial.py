@@ -21,11 +21,13 @@ from lfpiv.runs.frame_light import pair_light, read_darks
 from lfpiv.runs.pair_vectors import measure_vectors
 from lfpiv.settings.experiment import ExperimentTable
 
+LEAST_VOXELS = 4  # along each axis: the smallest window
+
 
 def measure(request: dict[str, Any]) -> dict[str, Any]:
     """Do what a request asks for; return the seconds that it took, and whether the cameras are calibrated."""
     stated = experiment_of(Path(request["experiment"]), ExperimentTable.model_validate(request["values"]))
-    experiment = coarse.coarsened(stated, request["coarser"] * stated.grid.voxel_mm, 4)  # the smallest window
+    experiment = coarse.coarsened(stated, request["coarser"] * stated.grid.voxel_mm, LEAST_VOXELS)
     stored = Folder(Path(request["results"])).calibration if request.get("results") else None
     calibrated = stored is not None and stored.is_file()
     calibration = lfpiv.load_calibration(stored) if calibrated else lfpiv.thin_lens(experiment)  # type: ignore[arg-type]

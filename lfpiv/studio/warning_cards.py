@@ -23,6 +23,8 @@ FIGURE = re.compile(r"\{[^}]*\}")
 PARTS = re.compile(r"((?:\([^)]*\)|.)*?(?:[;.] |: (?=check|look)|$))(.*)", re.DOTALL)
 """What a sentence says, up to the first stop outside brackets, and what to do."""
 
+REGION = ("left", "top", "right", "bottom")
+
 
 def card(record: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     """Return the card of a stored warning, or of one of a log, which has its ``text`` alone.
@@ -35,8 +37,7 @@ def card(record: Mapping[str, Any], cameras: Sequence[str]) -> dict[str, Any]:
     what, remedy = PARTS.findall(text)[0]
     figures, named = record.get("figures") or {}, str(record.get("subject") or text)
     camera = next((name for name in cameras if re.match(rf"{re.escape(name)}([,:]|$)", named)), "")
-    ends = [figures[name] for name in ("left", "top", "right", "bottom") if name in figures]
-    region = [int(end) for end in ends] if len(ends) == 4 else []
+    region = [int(figures[name]) for name in REGION] if all(name in figures for name in REGION) else []
     place = {"camera": camera, "image": _image(code, text, record), "region": region} if camera else None
     link = f"pages/troubleshooting#{code}"
     return {"what": what.rstrip(" ;:"), "remedy": remedy, "code": code, "place": place, "link": link}

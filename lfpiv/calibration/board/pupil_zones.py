@@ -24,7 +24,7 @@ INNER = 0.9
 
 _FEWEST = 8  # dots of a part
 _PRIOR_PITCHES = 0.2  # standard deviation of the prior on a displacement
-_CLEAR = 1.0  # root mean square over the zones of their rings' displacements in standard errors that is told
+_CLEAR = 1.0  # least displacement of rings that is told, rms over the zones [standard error]
 _LEAST_PITCHES = 0.01  # least displacement that is told: what is cut off at the edge of a pupil displaces less
 _ROUNDING = 1e-6  # least variance of an error, as a share of the largest
 _LEAST_SHARE = 1e-10  # least variance of displacements that is tried, as a share of the prior's: a millionth of a pitch
