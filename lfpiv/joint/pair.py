@@ -185,7 +185,7 @@ class PairSolver:
             log.warning("joint fit: %.0f %% of the vectors are valid; %s", *_share(vectors))
             return replace(alone, estimate=Estimate.NOT_STARTED)
         fit = fit_pair(model, alone.frames, model.field.fitted_to(vectors), progress)
-        log.info("joint fit: %d rounds; its misfit is %.2f times the misfit of the frames by themselves", fit.rounds, fit.misfit_ratio)
+        log.info("joint fit: %d rounds; misfit %.2f times the misfit of separate frames", fit.rounds, fit.misfit_ratio)
         frames = []
         for own, frame, end in zip(alone.frames, prepared, fit.residuals, strict=True):
             seen = weights.stored.restore(to_host(frame.normalisation.lit)) > 0
