@@ -148,6 +148,7 @@ class PreparedFrame:
             floor={name: one.floor for name, one in self.images.items()},
             camera_gain={name: one.camera_gain for name, one in self.images.items()},
             light_outside={name: one.light_outside for name, one in self.images.items()},
+            light={name: float(one.image.sum(dtype=np.float64)) for name, one in self.images.items()},
             sieve_voxel=self.normalisation.sieve.sigma_voxel,
             intensity_cap=self.intensity_cap,
             settings=self.settings,

@@ -52,6 +52,8 @@ class Reconstruction:
     """Brightness relative to the brightest camera."""
     light_outside: dict[str, float]
     """Part of an image's light in pixels that no voxel lights."""
+    light: dict[str, float]
+    """Sum of an image in pixels that voxels light [counts]."""
     sieve_voxel: float
     """Standard deviation of the sieve that was used [voxel]."""
     intensity_cap: float
@@ -106,6 +108,7 @@ class Reconstruction:
             "intensity_cap": self.intensity_cap,
             "camera_gain": list(self.camera_gain.values()),
             "light_outside": list(self.light_outside.values()),
+            "light": [round(value, 1) for value in self.light.values()],
             "normalisation": settings.normalisation,
             "accelerate": int(settings.accelerate),
             "sieve_voxel": self.sieve_voxel,

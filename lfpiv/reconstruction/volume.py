@@ -72,9 +72,10 @@ def reconstruct(
         ||I||, and `misfit`, the Kullback-Leibler divergence sum P' log(P'/I') - P' + I' with P' = P + b, I' = I + b,
         which SMART lowers [counts]: both before each iteration and after the last, over the pixels that voxels light,
         and of iterations over subsets but the first the sums of each subset's own before its step;
-        `light_outside`, by camera, the part of an image's light in the other pixels: from particles beyond the volume,
-        or reflections; `camera_gain`, by camera, its brightness relative to the brightest, in whose counts the volume
-        is; `stop`, why the iteration ended; the settings.
+        `light`, by camera, the sum of an image over these pixels [counts]; `light_outside`, by camera, the part of an
+        image's light in the other pixels: from particles beyond the volume, or reflections; `camera_gain`, by camera,
+        its brightness relative to the brightest, in whose counts the volume is; `stop`, why the
+        iteration ended; the settings.
 
     Raises
     ------

@@ -106,8 +106,8 @@ class ParticleFigures(_Figures):
 class PairFigures(_Figures):
     """Figures of a finished pair.
 
-    ``residual`` and ``stop`` have the frames as keys; ``structure``, ``camera_gain`` and ``light_outside`` have frames
-    and cameras.
+    ``residual`` and ``stop`` have the frames as keys; ``structure``, ``camera_gain``, ``light_outside`` and ``light``
+    have frames and cameras.
     """
 
     number: int = Field(alias="pair")
@@ -124,6 +124,7 @@ class PairFigures(_Figures):
     structure: dict[str, dict[str, float]] = {}
     camera_gain: dict[str, dict[str, float]] = {}
     light_outside: dict[str, dict[str, float]] = {}
+    light: dict[str, dict[str, float]] = {}
     particles: ParticleFigures | None = None
     """None without tracking."""
 

@@ -246,11 +246,14 @@ def _sheet_table(z: np.ndarray, profiles: Mapping[str, np.ndarray]) -> str:
     return markup.table(titles, rows, caption="Brightness inside and outside the light sheet")
 
 
+_IMAGE_FIGURES = ("structure", "camera_gain", "light_outside")  # those of `lfpiv.results.netcdf.OF_IMAGES` in the table
+
+
 def _images(pairs: Sequence[PairFigures], recording: Recording) -> str:
     """Tabulate medians over the images of each camera: structure, brightness and light beside the volume."""
     found: dict[str, dict[str, dict[str, float]]] = {}  # of camera, figure and volume
     for pair in pairs:
-        for name in netcdf.OF_IMAGES:
+        for name in _IMAGE_FIGURES:
             for frame, cameras in getattr(pair, name).items():
                 for camera, value in cameras.items():
                     found.setdefault(camera, {}).setdefault(name, {})[recording.named(pair.number, frame).label] = value
@@ -259,7 +262,7 @@ def _images(pairs: Sequence[PairFigures], recording: Recording) -> str:
     rows = []
     for camera, values in found.items():
         structure, gain, outside = (
-            float(np.median(list(values[name].values()))) if name in values else None for name in netcdf.OF_IMAGES
+            float(np.median(list(values[name].values()))) if name in values else None for name in _IMAGE_FIGURES
         )
         rows.append([camera, number(structure, 2), number(gain, 2), percent(outside)])
     text = (

@@ -39,9 +39,9 @@ FIELD = "field"
 
 _GROUP_AXES = {axis: f"voxel_{axis}" for axis in AXES}  # in the file z, y, x are the axes of the vectors
 
-OF_IMAGES = ("structure", "camera_gain", "light_outside")
-"""Figures of each camera's image: correlation of near pixels, brightness relative to the brightest camera, and the
-share of its light in pixels that no voxel lights."""
+OF_IMAGES = ("structure", "camera_gain", "light_outside", "light")
+"""Figures of each camera's image: correlation of near pixels, brightness relative to the brightest camera, the share of
+its light in pixels that no voxel lights, and its light in the other pixels [counts]."""
 
 
 def build_reconstruction(

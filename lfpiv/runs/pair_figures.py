@@ -109,6 +109,7 @@ class PairFigures:
     structure: ByFrame | None = None
     camera_gain: ByFrame | None = None
     light_outside: ByFrame | None = None
+    light: ByFrame | None = None
     stop: Mapping[str, str] | None = None
     """Frame -> why the iteration ended."""
 

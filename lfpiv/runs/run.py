@@ -43,6 +43,7 @@ from lfpiv.runs.refinement import Refinement
 from lfpiv.runs.repeated_images import repeated_images
 from lfpiv.runs.reversed_pairs import reversed_pairs, still
 from lfpiv.runs.summary import Contents, EarlierSummary
+from lfpiv.runs.unlike_pulses import unlike_pulses
 from lfpiv.warn import Gathering, Warning, collected, warn
 from lfpiv_kernels import runtime
 
@@ -316,8 +317,9 @@ class Run:
             self._keep(self.files(pair))
 
     def _unlike_pairs(self, contents: Contents) -> list[Warning]:
-        """Log and return the warnings about pairs unlike the others, by flow or a camera's scale, and pairs at rest."""
+        """Log and return the warnings about pairs unlike the others, pairs at rest, and cameras with unlike pulses."""
         found = [*reversed_pairs(contents.vectors), *still(contents.vectors), *other_scales(contents.vectors)]
+        found += unlike_pulses(contents.vectors)
         for warning in found:
             log.warning("%s", warning.sentence)
         return found

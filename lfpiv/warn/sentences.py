@@ -75,6 +75,7 @@ class Code(enum.Enum):
     REVERSED = "reversed"
     STILL = "still"
     OTHER_SCALE = "other_scale"
+    UNLIKE_PULSES = "unlike_pulses"
     FEW_VECTORS = "few_vectors"
     CROWDED = "crowded"
     UNLINKED = "unlinked"
@@ -324,6 +325,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.OTHER_SCALE: (
         "the counts relative to {others} are about {ratio:.0f} times as {how} as in the other pairs: gain, exposure, "
         "or the scale of the files changed. Each camera's scale is divided out in every pair, up to 25 times"
+    ),
+    Code.UNLIKE_PULSES: (
+        "second frames are {ratio:.2f} times as bright, relative to first frames, as those of {other}, although all "
+        "cameras see the same pulses. If light of first frames stays on the sensor (afterglow), displacements are "
+        "wrong. Record with the second pulse blocked: second frames must be dark. Unlike exposures do no harm"
     ),
     Code.FEW_VECTORS: (
         "few vectors: {counts}; derivatives need {least:.0f} along each axis, so report, exports and lfpiv.derived are "

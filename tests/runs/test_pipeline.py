@@ -81,7 +81,7 @@ def test_every_file_of_the_contract_is_there_and_whole(finished):
         assert 0 < figures["dots_found"] <= figures["dots_expected"] <= 5 * 5 * 3
         assert 0 < figures["network_correction_pitch"] < 0.1  # rendered by an ideal lens: hardly anything is left
     assert [len(pair["residual"]["a"]) for pair in summary["pairs"]] == [10] * PAIRS and summary["failed"] == []
-    for figure in ("structure", "camera_gain", "light_outside"):
+    for figure in ("structure", "camera_gain", "light_outside", "light"):
         assert all(set(pair[figure]["b"]) == {"left", "right"} for pair in summary["pairs"])
     assert all(max(pair["camera_gain"]["a"].values()) == 1 for pair in summary["pairs"])
     assert not any("noise" in text for text in summary["warnings"])
