@@ -129,8 +129,8 @@ def parse(text: str, path: Path) -> dict[str, Any]:
     level: list[Any] = [values]
     for _ in range(DEEPEST + 1):
         level = [one for value in level for one in (value.values() if isinstance(value, dict) else value)]
-        if large := [value for value in level if isinstance(value, int) and abs(value) >= LARGEST_WHOLE]:
-            raise InputError(f"{path}: expected whole numbers below 2^63, found {large[0]}.")
+        if any(isinstance(value, int) and abs(value) >= LARGEST_WHOLE for value in level):
+            raise InputError(f"{path}: expected whole numbers below 2^63, found a larger one.")
         level = [value for value in level if isinstance(value, (dict, list))]
     if level:
         raise InputError(deep)
