@@ -227,6 +227,7 @@ def _calibrate_camera(
     quality = _quality(sensor, dots, mapping, nominal, int(rejected.sum()))
     training_dots = len(np.unique(dots.dot[mapping.agreeing][mapping.training.split.training]))
     checks.check_mapping(setup, quality, mapping.training.network, experiment.network.estimator, training_dots)
+    checks.check_dot_size(setup, dots, lens, sensor.lattice)
     checks.check_pupil_zones(setup, dots, sensor.lattice.pitch_mm)
     log.info(
         "camera %s: calibrated with %d of %d dots; rays are off by %.2g microlens pitches (sigma_nor)",

@@ -25,6 +25,7 @@ from lfpiv.calibration.quality import CalibrationQuality
 from lfpiv.calibration.thin_lens_model import ThinLensModel
 from lfpiv.errors import InputError
 from lfpiv.experiment.experiment import CameraSetup, Experiment, white_level
+from lfpiv.geometry.optics import LensLattice
 from lfpiv.geometry.orientation import Orientation
 from lfpiv.lightfield.decoder import LightFieldDecoder
 from lfpiv.lightfield.frame_comparison import fingerprint
@@ -57,6 +58,9 @@ MEDIUM = 0.1
 """Difference of the refractive index of what the board stands in from 1 above which a warning is due."""
 COMPLETE = 0.9
 """Part of the expected dots that a complete board shows."""
+HIDDEN_SHARE, HIDDEN_PITCH = 0.4, 0.05
+"""Share of the dots whose light stays within one microlens from which a warning is due, and the light beyond the
+microlens that is hardly seen [pitch]."""
 SIGMA_NOR_PITCH = {"lens_integral": 0.03, "gaussian": 0.1}
 """Error on held-out dots above which a warning is due, by estimator [microlens pitch]."""
 LENS_ARRAY_RMS_PX = 0.25
@@ -315,6 +319,27 @@ def check_mapping(
         doubt(Code.FEW_LABELS, dots=training_dots, values=values, parameters=parameters)
     if not quality.sigma_nor_test <= SIGMA_NOR_PITCH[estimator]:
         doubt(Code.MAPPING_ERROR, sigma_nor=quality.sigma_nor_test, usual=SIGMA_NOR_PITCH[estimator])
+
+
+def check_dot_size(setup: CameraSetup, dots: BoardDots, lens: ThinLensModel, lattice: LensLattice) -> None:
+    """Warn where the light of many dots stays within one microlens along a row of the array, whatever the pupil point.
+
+    The lens tells where their light lies, since the labels of such dots do not.
+    """
+    points = np.unique(dots.points_mm, axis=0)
+    middle, radius = np.zeros((len(points), 2)), setup.optics.pupil_radius_mm
+    chief = lens(points, middle)
+    offset = chief - lattice.centres_mm(lattice.nearest(chief))
+    x, y = (lens(points + dots.diameter_mm / 2 * np.eye(3)[axis], middle) - chief for axis in (0, 1))
+    u, v = (lens(points, middle + radius * np.eye(2)[axis]) - chief for axis in (0, 1))
+    share = 0.0
+    for row in np.asarray(lattice.basis_mm) / lattice.pitch_mm:
+        reach = np.abs(offset @ row) + np.hypot(x @ row, y @ row) + np.hypot(u @ row, v @ row)
+        share = max(share, float(np.mean(reach < (0.5 + HIDDEN_PITCH) * lattice.pitch_mm)))
+    if share > HIDDEN_SHARE:
+        diameter_mm = setup.optics.microlens_pitch_mm / abs(setup.optics.magnification)
+        figures = {"share": share, "diameter_mm": diameter_mm}
+        warn(log, Warning(code=Code.SMALL_DOTS, subject=setup.name, figures=figures))
 
 
 def check_pupil_zones(setup: CameraSetup, dots: BoardDots, pitch_mm: float) -> None:

@@ -46,6 +46,7 @@ class Code(enum.Enum):
     SCALES = "scales"
     FEW_LABELS = "few_labels"
     MAPPING_ERROR = "mapping_error"
+    SMALL_DOTS = "small_dots"
     PUPIL_ZONE = "pupil_zone"
     # cameras and volume
     OUTSIDE_CALIBRATION = "outside_calibration"
@@ -226,6 +227,11 @@ SENTENCES: Mapping[Code, str] = {
     Code.MAPPING_ERROR: (
         "the mapping is {sigma_nor:.3f} pitch off (sigma_nor), {usual:g} and less is usual; use more dots or planes, "
         "and check the board's images."
+    ),
+    Code.SMALL_DOTS: (
+        "the light of {share:percent} % of the dots stays within one microlens from side to side, which does not show "
+        "where in the microlens they lie: the mapping may be off by more than is stated. Use dots of {diameter_mm:.2g} "
+        "mm or more (microlens_pitch_mm / |magnification|)."
     ),
     Code.PUPIL_ZONE: (
         "the dots' light lies up to {off_pitch:.3f} pitch beside the fitted rays, most at ({u:.1f}, {v:.1f}) pupil "

@@ -328,6 +328,28 @@ def test_few_dots_and_a_poor_mapping_are_warned_of(rig):
         assert all(part in warning.sentence for part, warning in zip(expected, found, strict=True))
 
 
+def test_dots_whose_light_stays_within_a_microlens_are_warned_of(rig):
+    """Small dots in focus, at the middles of microlenses; half a pitch away, or larger, they light two of them."""
+    experiment, _, _ = rig
+    setup, optics = experiment.cameras[0], experiment.cameras[0].optics
+    pitch_mm = optics.microlens_pitch_mm
+    lattice = LensLattice(origin_mm=(0.0, 0.0), basis_mm=((pitch_mm, 0.0), (0.0, pitch_mm)))
+    lens = lfpiv.thin_lens(experiment).cameras["only"].baseline
+    spacing_mm = 2 * pitch_mm / abs(optics.magnification)
+
+    def told(diameter_pitches, *, shift_pitches=0.0):
+        places = spacing_mm * np.stack(np.meshgrid(*[np.arange(-3, 4)] * 2), -1).reshape(-1, 2)
+        places = places + shift_pitches * spacing_mm / 2
+        facing = places @ rotation(-30.0)[:2]  # in the plane in focus of a camera at -30 degrees
+        dots = SimpleNamespace(points_mm=facing, diameter_mm=diameter_pitches * spacing_mm / 2)
+        with warn.collected() as found:
+            checks.check_dot_size(setup, dots, lens, lattice)
+        return [warning.code for warning in found]
+
+    assert told(0.6) == [Code.SMALL_DOTS]
+    assert told(0.6, shift_pitches=0.5) == told(1.4) == []
+
+
 @pytest.mark.parametrize(
     ("pitch_px", "layout", "fill", "blur", "dark"),
     [
