@@ -108,7 +108,7 @@ class Reconstruction:
             "intensity_cap": self.intensity_cap,
             "camera_gain": list(self.camera_gain.values()),
             "light_outside": list(self.light_outside.values()),
-            "light": [round(value, 1) for value in self.light.values()],
+            "light": list(self.light.values()),
             "normalisation": settings.normalisation,
             "accelerate": int(settings.accelerate),
             "sieve_voxel": self.sieve_voxel,
